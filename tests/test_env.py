@@ -1,0 +1,224 @@
+"""The rules of the forest: rewards at every knee, geometry, laser, outcomes, flights reflown."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from env import ForestEnv, World, plant, refly, reward
+
+WORLD = World()
+CLEARING = replace(WORLD, rows=0)  # no trunks
+
+
+def fly(env: ForestEnv, actions: Sequence[int], seed: int = 0) -> tuple:
+    """Reset and fly; returns what the last step returned."""
+    env.reset(seed=seed)
+    for action in actions:
+        result = env.step(action)
+    return result
+
+
+@pytest.mark.parametrize(
+    ("d_obs", "d_goal", "expected"),
+    [
+        (20.0, 90.0, 0.25),  # far from trunks, no way made
+        (2.0001, 90.0, 0.25),  # just safe
+        (2.0, 90.0, 0.0),  # r_neg
+        (1.375, 90.0, -2.5),  # halfway
+        (0.75, 90.0, -5.0),  # r_precrash
+        (20.0, 45.0, 0.75),  # half the way made
+        (20.0, 0.0, 1.25),  # at the goal
+        (20.0, 99.0, 0.15),  # behind the start the way counts against
+        (1.375, 45.0, -2.0),
+    ],
+)
+def test_the_live_reward_at_every_knee_of_the_papers_formula(
+    d_obs: float, d_goal: float, expected: float
+) -> None:
+    assert reward("", d_obs, d_goal, WORLD) == pytest.approx(expected)
+
+
+def test_crashing_and_leaving_cost_ten_and_nothing_else() -> None:
+    assert reward("crash", 0.7, 10.0, WORLD) == reward("left", 20.0, 0.0, WORLD) == -10.0
+
+
+def test_arrival_and_the_time_limit_pay_the_live_reward() -> None:
+    for outcome in ("goal", "time"):
+        assert reward(outcome, 5.0, 3.0, WORLD) == reward("", 5.0, 3.0, WORLD)
+
+
+def test_every_forest_is_150_trunks_within_the_jitter_of_the_grid() -> None:
+    grid = np.array([(7.5 + 6 * i, -22 + 5 * j) for i in range(15) for j in range(10)])
+    for seed in range(200):
+        offset = plant(seed, WORLD) - grid
+        assert offset.shape == (150, 2)
+        assert (np.abs(offset) <= [1.0, 2.5]).all()
+    assert np.abs(offset[:, 1]).max() > 1.5  # the jitter is that of the axis, not of the other
+
+
+def test_a_forest_is_its_seed_and_nothing_else() -> None:
+    np.random.default_rng(7).random()
+    assert (plant(3 * 10**9, WORLD) == plant(3 * 10**9, WORLD)).all()
+    assert (plant(1, WORLD) != plant(2, WORLD)).all()
+
+
+def test_the_jitter_is_uniform() -> None:
+    x = np.concatenate(
+        [plant(s, WORLD)[:, 0] - np.repeat(7.5 + 6 * np.arange(15), 10) for s in range(100)]
+    )
+    assert x.mean() == pytest.approx(0, abs=0.02)
+    assert x.var() == pytest.approx(1 / 3, abs=0.01)
+
+
+def test_the_scans_minimum_agrees_with_d_obs() -> None:
+    env, rng = ForestEnv(camera=False), np.random.default_rng(0)
+    for seed in range(30):
+        env.reset(seed=seed)
+        while not env.outcome:
+            _, distance = env.scan()
+            assert distance.min() == pytest.approx(env.d_obs, abs=0.05)
+            env.step(int(rng.integers(9)))
+
+
+def test_the_scan_starts_dead_ahead_and_goes_counter_clockwise() -> None:
+    env = ForestEnv(camera=False)
+    env.reset(seed=0)
+    env.trunks = np.array([[0.0, 5.0]])
+    bearings, distance = env.scan()
+    assert bearings[distance.argmin()] == pytest.approx(math.pi / 2)
+    assert distance.min() == pytest.approx(4.5)
+    assert distance[0] == 20.0
+
+
+def test_going_straight_makes_half_a_metre_a_step() -> None:
+    *_, info = fly(ForestEnv(CLEARING), [4] * 10)
+    assert info["pose"] == pytest.approx((5.0, 0.0, 0.0))
+    assert info["d_goal"] == pytest.approx(85.0)
+    assert info["d_obs"] == 20.0
+
+
+@pytest.mark.parametrize("action", range(9))
+def test_each_action_turns_at_its_yaw_rate_and_then_flies(action: int) -> None:
+    rate = 0.7 * (action - 4) / 4  # 0 is right, 8 is left
+    *_, info = fly(ForestEnv(CLEARING), [action] * 7)
+    headings = rate * 0.1 * np.arange(1, 8)
+    expected = (0.5 * np.cos(headings).sum(), 0.5 * np.sin(headings).sum(), 0.7 * rate)
+    assert info["pose"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("actions", "outcome", "edge"),
+    [
+        ([4] * 175, "goal", ""),
+        ([8] * 22 + [4] * 50, "left", "side"),
+        ([8] * 45 + [4] * 60, "left", "back"),
+        ([8] * 4 + [4] * 30 + [0] * 4 + [4] * 160, "left", "far"),
+        ([4] * 40 + [8] * 960, "time", ""),
+    ],
+)
+def test_each_flight_has_its_outcome_and_its_edge(
+    actions: list[int], outcome: str, edge: str
+) -> None:
+    env = ForestEnv(CLEARING, camera=False)
+    env.reset(seed=0)
+    flown = iter(actions)
+    while not env.outcome:
+        _, r, terminated, truncated, info = env.step(next(flown))
+    assert (info["outcome"], info["edge"]) == (outcome, edge)
+    assert truncated == (outcome == "time")
+    assert terminated != truncated
+    assert (r == -10.0) == (outcome == "left")
+
+
+def test_a_flight_into_a_trunk_is_a_crash() -> None:
+    env = ForestEnv(camera=False)
+    for seed in range(20):
+        *_, (_, r, terminated, truncated, info) = refly(seed, straight_to_the_end(env, seed), WORLD)
+        assert terminated
+        assert not truncated
+        if info["outcome"] == "crash":
+            assert info["d_obs"] < 0.75
+            assert r == -10.0
+
+
+def straight_to_the_end(env: ForestEnv, seed: int) -> list[int]:
+    """As many straight steps as the flight lasts."""
+    env.reset(seed=seed)
+    while not env.outcome:
+        env.step(4)
+    return env.actions
+
+
+def test_a_flight_is_its_seed_and_its_actions() -> None:
+    rng = np.random.default_rng(3)
+    env = ForestEnv(replace(WORLD, beacon=True))
+    for seed in (0, 5, 2 * 10**9, 10**40):
+        observation, _ = env.reset(seed=seed)
+        frames, rewards = [observation], [0.0]
+        while not env.outcome:
+            observation, r, *_ = env.step(int(rng.integers(2, 7)))
+            frames.append(observation)
+            rewards.append(r)
+        again = list(refly(seed, map(int, env.flight()["actions"]), env.world))
+        assert all((a == b[0]).all() for a, b in zip(frames, again, strict=True))
+        assert rewards == [step[1] for step in again]
+        assert again[-1][-1]["progress"] == env.flight()["progress"]
+
+
+def test_an_observation_is_the_last_four_frames_and_starts_as_one_frame_four_times() -> None:
+    env = ForestEnv()
+    first, _ = env.reset(seed=0)
+    assert first.shape == (4, 84, 84)
+    assert first.dtype == np.uint8
+    assert (first == first[0]).all()
+    second, *_ = env.step(4)
+    third, *_ = env.step(4)
+    assert (second[:3] == first[1:]).all()
+    assert (third[:3] == second[1:]).all()
+    assert (third[3] != third[2]).any()
+
+
+def test_without_a_camera_only_the_frames_are_missing() -> None:
+    seeing, blind = ForestEnv(), ForestEnv(camera=False)
+    assert not fly(blind, [4, 5, 6])[0].any()
+    assert fly(blind, [4, 5, 6])[1:] == fly(seeing, [4, 5, 6])[1:]
+
+
+def test_step_returns_plain_python_numbers_as_gymnasium_asks() -> None:
+    _, r, terminated, truncated, info = fly(ForestEnv(), [4])
+    assert type(r) is float
+    assert type(terminated) is type(truncated) is bool
+    assert type(info["d_obs"]) is type(info["d_goal"]) is float
+
+
+def test_without_a_seed_the_next_forest_is_the_next_number() -> None:
+    env = ForestEnv(camera=False)
+    env.reset(seed=41)
+    env.reset()
+    assert env.seed == 42
+
+
+@pytest.mark.parametrize("action", [-1, 9, 0.5, None, "4"])
+def test_an_impossible_action_is_named(action: object) -> None:
+    env = ForestEnv(camera=False)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="allowed are 0 to 8"):
+        env.step(action)
+
+
+def test_a_flight_that_is_over_or_not_begun_cannot_go_on() -> None:
+    env = ForestEnv(camera=False)
+    with pytest.raises(ValueError, match="reset"):
+        env.step(4)
+    straight_to_the_end(env, 0)
+    with pytest.raises(ValueError, match="reset"):
+        env.step(4)
+
+
+def test_a_drone_that_could_step_over_a_trunk_is_no_legal_world() -> None:
+    with pytest.raises(ValueError, match="step over"):
+        World(speed=13.0)
+    World(speed=12.0)
