@@ -1,0 +1,510 @@
+"""deepflight.py: the experiment. Train a pilot, fly it against others, print honest numbers.
+
+    python deepflight.py train                  the default recipe, in the paper's world
+    python deepflight.py train --beacon         the same with a visible goal
+    python deepflight.py train --preset mnih    the paper's training parameters [Mnih15]
+    python deepflight.py eval                   fly weights/paper.pt against three other pilots
+    python deepflight.py eval --beacon          fly weights/beacon.pt where the goal is visible
+
+Seeds: training plants forests from [0, 10^9), test points choose weights on [10^9, 2 * 10^9), and
+`eval` flies from 2 * 10^9 on, so no forest that shaped or chose the weights is ever evaluated.
+Not in this file: anything about pictures (render.py), flying (env.py) or learning (dqn.py).
+"""
+
+import argparse
+import csv
+import itertools
+import json
+import math
+import pickle
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import torch
+
+import render
+from dqn import CUT, DEAD, DQN, GOAL, LIVE, QNetwork, Replay, greedy, linear
+from env import OUTCOMES, ForestEnv, World, plant, refly
+
+TRAIN_SEEDS, TEST_SEED, EVAL_SEED = 10**9, 10**9, 2 * 10**9
+PRECISIONS = ("auto", "bfloat16", "float32")
+RANDOM_FLIGHTS = 2000  # with fewer the bar itself, random's mean flight, moves by 20 %
+BFLOAT16 = torch.cpu._is_avx512_bf16_supported()  # natively, or it would be slower than float32
+
+
+def setting(default: Any, text: str, *allowed: Any) -> Any:
+    """One field of Config: default, help with unit and source, and the range or choice allowed."""
+    return field(default=default, metadata={"help": text, "allowed": allowed})
+
+
+INF = math.inf
+
+
+@dataclass(frozen=True)
+class Config:
+    """Every setting of a training; each is a flag of `train`."""
+
+    steps: int = setting(300_000, "control steps in all", 1, INF)
+    seed: int = setting(0, "of everything random", 0, INF)
+    beacon: bool = setting(False, "put a visible pole at the goal", 0, 1)
+    lanes: int = setting(8, "drones flown at once, one forest each", 1, 1000)
+    gamma: float = setting(0.99, "discount a step [DF II-A]", 0, 1)
+    n: int = setting(5, "rewards in a return before the bootstrap", 1, 100)
+    double: bool = setting(True, "let Q choose the action that the target network values", 0, 1)
+    goal_value: float = setting(100.0, "of arrival in the target: 1 a step for ever", -INF, INF)
+    mirror: bool = setting(True, "reflect half of every batch left to right", 0, 1)
+    batch: int = setting(32, "transitions an update [Mnih15]", 1, 10_000)
+    update_every: int = setting(4, "control steps an update [Mnih15]", 1, INF)
+    target_every: int = setting(500, "updates between copies to the target network", 1, INF)
+    replay: int = setting(200_000, "transitions remembered, 7.1 kB each", 1, INF)
+    warmup: int = setting(5_000, "control steps before the first update", 1, INF)
+    epsilon_start: float = setting(1.0, "share of random actions at first [Mnih15]", 0, 1)
+    epsilon_final: float = setting(0.05, "share of random actions in the end", 0, 1)
+    epsilon_decay: int = setting(40_000, "control steps from first to final", 1, INF)
+    optimizer: str = setting("adam", "adam, or Mnih's rmsprop", "adam", "rmsprop")
+    lr: float = setting(1e-4, "learning rate at first", 0, 1)
+    lr_final: float = setting(1e-5, "and in the end, linear between", 0, 1)
+    optimizer_eps: float = setting(1.5e-4, "the optimizer's epsilon", 0, 1)
+    max_grad_norm: float = setting(10.0, "longer gradients are cut to this; 0: never", 0, INF)
+    precision: str = setting("auto", "of the convolutions; auto: bfloat16 if native", *PRECISIONS)
+    device: str = setting("cpu", "cpu; cuda is untested", "cpu", "cuda")
+    threads: int = setting(2, "of torch; another number gives other last digits", 1, 256)
+    test_every: int = setting(5_000, "control steps between test points", 1, INF)
+    test_forests: int = setting(48, "forests a test point", 1, 10_000)
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value, allowed = getattr(self, f.name), f.metadata["allowed"]
+            legal = value in allowed if f.type is str else allowed[0] <= value <= allowed[1]
+            if not legal:
+                text = " or ".join(allowed) if f.type is str else "{:g} to {:g}".format(*allowed)
+                raise ValueError(f"{f.name} is {value}, allowed: {text}")
+        rows, least = min(self.replay, self.warmup) // self.lanes, self.n + 4
+        if rows < least:
+            raise ValueError(
+                f"replay is {self.replay} and warmup {self.warmup}, "
+                f"allowed: at least lanes * (n + 4) = {self.lanes * least} each"
+            )
+
+
+# [Mnih15, Extended Data Table 1], as the paper says [DF II-B]; 1.4 M steps are the paper's own
+MNIH = dict(
+    steps=1_400_000, n=1, double=False, goal_value=0.0, mirror=False, target_every=10_000,
+    replay=1_000_000, warmup=50_000, epsilon_final=0.1, epsilon_decay=1_000_000,
+    optimizer="rmsprop", lr=2.5e-4, lr_final=2.5e-4, optimizer_eps=0.01, max_grad_norm=0.0,
+    precision="float32", test_every=20_000,
+)  # fmt: skip
+PRESETS = {"default": {}, "mnih": MNIH}
+
+
+# -------------------------------------------------- pilots: a list of forests -> an action in each
+
+Pilot = Callable[[Sequence[ForestEnv]], Sequence[int]]
+
+
+def random_pilot(rng: np.random.Generator) -> Pilot:
+    """Every action uniform and independent: the paper's bar."""
+    return lambda envs: rng.integers(envs[0].world.actions, size=len(envs))
+
+
+def straight_pilot(envs: Sequence[ForestEnv]) -> Sequence[int]:
+    """Dead ahead, whatever comes."""
+    return [env.world.actions // 2 for env in envs]
+
+
+def laser_pilot(envs: Sequence[ForestEnv]) -> Sequence[int]:
+    """A dynamic window on the scan and the goal's bearing: the bar for the camera."""
+    return [dynamic_window(*env.scan(), env.goal_bearing(), env.world) for env in envs]
+
+
+def dynamic_window(
+    bearings: np.ndarray, distances: np.ndarray, goal_bearing: float, world: World
+) -> int:
+    """Simulate 1.5 s of each yaw rate against the scan's points and take the best.
+
+    score = 10 * seconds until the clearance is below 0.8 m + 2 * least clearance (2 m at most)
+            - 4 * heading error to the goal at the arc's end in rad
+    """
+    hit = distances < world.laser_range
+    points = (distances * np.exp(1j * bearings))[hit]  # (P,) complex: x + iy in the drone's axes
+    rates = world.yaw_rate * np.linspace(-1, 1, world.actions)  # (A,) rad/s
+    headings = rates[:, None] * world.dt * np.arange(1, 16)  # (A, 15) rad
+    arcs = np.cumsum(world.speed * world.dt * np.exp(1j * headings), 1)  # (A, 15) m
+    clearance = np.abs(arcs[..., None] - points).min(-1, initial=world.laser_range)  # (A, 15) m
+    safe = np.logical_and.accumulate(clearance >= 0.8, 1).sum(1) * world.dt  # (A,) s
+    turn = goal_bearing - headings[:, -1]
+    error = np.abs(np.angle(np.exp(1j * turn)))  # (A,) rad, wrapped
+    return int(np.argmax(10 * safe + 2 * np.minimum(clearance.min(1), 2) - 4 * error))
+
+
+def dqn_pilot(q: QNetwork) -> Pilot:
+    """The greedy policy of a Q-network: four frames and nothing else."""
+    return lambda envs: greedy(q, np.stack([env.observation for env in envs]))
+
+
+def fly(name: str, pilot: Pilot, seeds: Sequence[int], world: World) -> list[dict]:
+    """Fly one forest a seed, a hundred at once; returns the flights in the order of the seeds."""
+    flights = []
+    for group in (seeds[i : i + 100] for i in range(0, len(seeds), 100)):
+        envs = [ForestEnv(world, camera=name == "dqn") for _ in group]
+        for env, seed in zip(envs, group, strict=True):
+            env.reset(seed=seed)
+        while flying := [env for env in envs if not env.outcome]:
+            landed = len(flights) + len(envs) - len(flying)
+            live(f"{name}: {landed:,} of {len(seeds):,} flights have landed")
+            for env, a in zip(flying, pilot(flying), strict=True):
+                env.step(a)
+        flights += [env.flight() for env in envs]
+    return flights
+
+
+def fly_random(seeds: Sequence[int], world: World, rng: np.random.Generator) -> list[dict]:
+    """The bar: 2,000 random flights or more, equally many through each forest."""
+    repeats = math.ceil(RANDOM_FLIGHTS / len(seeds))
+    return fly("random", random_pilot(rng), list(seeds) * repeats, world)
+
+
+def measure(flights: Sequence[dict]) -> dict[str, np.ndarray]:
+    """One number a flight (F,): steps, progress in m, return, and 0 or 1 for how it ended.
+
+    Crossed means arrived at the goal or left by the far edge.
+    """
+    table = {key: np.array([f[key] for f in flights]) for key in ("steps", "progress", "return")}
+    table["crossed"] = np.array([f["outcome"] == "goal" or f["edge"] == "far" for f in flights])
+    return table | {o: np.array([f["outcome"] == o for f in flights]) for o in OUTCOMES}
+
+
+def mean(flights: Sequence[dict], key: str) -> float:
+    """Of the flights, or not a number where none has ended yet."""
+    return sum(f[key] for f in flights) / len(flights) if flights else math.nan
+
+
+# -------------------------------------------------- train
+
+END = {"": LIVE, "crash": DEAD, "left": DEAD, "goal": GOAL, "time": CUT}
+COLUMNS = {  # what a status line shows: name in log.csv -> heading, format
+    "step": ("step", "9,"), "episodes": ("episodes", "9,"), "epsilon": ("epsilon", "8.2f"),
+    "speed": ("steps/s", "8.0f"), "left": ("min left", "9.1f"),
+    "train_return": ("| train: return", "15.1f"), "train_steps": ("steps", "7.1f"),
+    "test_return": ("| test: return", "14.1f"), "test_steps": ("steps", "7.1f"),
+    "test_over_random": ("over random", "12.0%"), "test_progress": ("progress", "9.1f"),
+    "test_crash": ("crash", "6.0%"), "test_goal": ("goal", "6.0%"),
+    "test_left": ("left", "6.0%"), "test_time": ("time", "6.0%"),
+}  # fmt: skip
+
+
+def train(c: Config, folder: Path) -> None:
+    """Algorithm 1 of [Mnih15], over c.lanes forests at once; its line numbers are in dqn.py."""
+    torch.set_num_threads(c.threads)
+    world = World(beacon=c.beacon)
+    flight_rng, batch_rng, bar_rng = np.random.default_rng(c.seed).spawn(3)
+    test_seeds = range(TEST_SEED, TEST_SEED + c.test_forests)
+    bar = measure(fly_random(test_seeds, world, bar_rng))["steps"].mean()
+    memory = Replay(c.replay, c.lanes)  # line 1
+    agent = DQN(c, world.actions, c.seed)  # lines 2, 3
+    envs = [ForestEnv(world) for _ in range(c.lanes)]
+    for env in envs:
+        env.reset(seed=int(flight_rng.integers(TRAIN_SEEDS)))  # lines 4, 5
+    log, timing, recent, episodes, start = [], [], deque(maxlen=100), 0, time.perf_counter()
+    print("".join(f"{head:>{len(format(0, form))}}" for head, form in COLUMNS.values()))
+    for step in range(c.lanes, c.steps + c.lanes, c.lanes):  # line 6
+        eps = linear(step, c.epsilon_start, c.epsilon_final, c.epsilon_decay)
+        landed = interact(envs, agent.q, eps, memory, flight_rng)
+        recent.extend(landed)
+        episodes += len(landed)
+        lr = linear(step, c.lr, c.lr_final, c.steps)
+        for _ in range(times_due(step, c.lanes, c.update_every) if step >= c.warmup else 0):
+            agent.learn(memory, lr, batch_rng)
+        row = {"step": step, "episodes": episodes, "updates": agent.updates, "epsilon": eps}
+        row |= {f"train_{key}": mean(recent, key) for key in ("return", "steps")}
+        seconds = time.perf_counter() - start
+        speed = {"speed": step / seconds, "left": (c.steps - step) * seconds / step / 60}
+        live(status(row | speed))
+        if times_due(step, c.lanes, c.test_every) or step >= c.steps:
+            log.append(row | test(agent.q, test_seeds, world, bar))
+            timing.append({"step": step, "seconds": round(time.perf_counter() - start, 1)})
+            print(status(log[-1] | speed), flush=True)
+            write_csv(folder / "log.csv", log)
+            write_csv(folder / "timing.csv", timing)
+            if log[-1]["test_progress"] == max(past["test_progress"] for past in log):
+                save_weights(folder / "best.pt", agent.q, c.beacon)
+
+
+def interact(
+    envs: Sequence[ForestEnv], q: QNetwork, eps: float, memory: Replay, rng: np.random.Generator
+) -> list[dict]:
+    """One control step in each of L forests, epsilon-greedily; returns the flights that ended."""
+    lanes, actions = len(envs), envs[0].world.actions
+    s = np.stack([env.observation for env in envs])  # (L, 4, 84, 84)
+    explore = rng.random(lanes) < eps  # (L,) line 7
+    a = np.where(explore, rng.integers(actions, size=lanes), greedy(q, s))  # (L,) line 8
+    steps = [env.step(action) for env, action in zip(envs, a.tolist(), strict=True)]  # lines 9, 10
+    s2, r = [step[0] for step in steps], [step[1] for step in steps]
+    memory.add(s, a, r, s2, [END[env.outcome] for env in envs])  # line 11
+    over = [env for env in envs if env.outcome]
+    flights = [env.flight() for env in over]
+    for env in over:
+        env.reset(seed=int(rng.integers(TRAIN_SEEDS)))  # lines 4, 5
+    return flights
+
+
+def times_due(step: int, stride: int, every: int) -> int:
+    """How often a thing done every so many steps falls due in the last stride of them.
+
+    >>> times_due(16, 8, 4), times_due(16, 8, 10), times_due(24, 8, 10)
+    (2, 1, 1)
+    """
+    return step // every - (step - stride) // every
+
+
+def status(row: dict) -> str:
+    """One line of a training: the columns that the row has."""
+    return "".join(format(row[key], form) for key, (_, form) in COLUMNS.items() if key in row)
+
+
+def test(q: QNetwork, seeds: Sequence[int], world: World, bar: float) -> dict[str, float]:
+    """Means over the greedy policy's flights through the test forests."""
+    flights = measure(fly("dqn", dqn_pilot(q), seeds, world))
+    row = {f"test_{key}": float(values.mean()) for key, values in flights.items()}
+    return row | {"test_over_random": row["test_steps"] / bar - 1}
+
+
+def live(text: str) -> None:
+    """Show a passing status on a terminal; nothing when piped."""
+    if sys.stdout.isatty():
+        print(f"\r{text}\x1b[K\r", end="", flush=True)
+
+
+def write_csv(path: Path, rows: Sequence[dict]) -> None:
+    """One line a row under a line of names."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def save_weights(path: Path, q: QNetwork, beacon: bool) -> None:
+    """Half precision, 3.4 MB, and the world they were trained in."""
+    half = {name: value.half().cpu() for name, value in q.state_dict().items()}
+    torch.save({"beacon": beacon, "network": half}, path)
+
+
+def load_weights(path: Path, beacon: bool) -> QNetwork:
+    """Read what save_weights wrote; never runs code from the file. Raises ValueError."""
+    try:
+        saved = torch.load(path, weights_only=True)
+        trained_with = saved["beacon"]
+        q = QNetwork(World.actions)
+        q.load_state_dict(saved["network"])
+    except FileNotFoundError:
+        raise ValueError(f"weights {path} do not exist") from None
+    except (OSError, EOFError, RuntimeError, LookupError, TypeError, pickle.UnpicklingError):
+        raise ValueError(f"{path} is not a weights file of Deep Flight") from None
+    if trained_with != beacon:
+        raise ValueError(f"{path} was trained {'with' if trained_with else 'without'} the beacon")
+    return q
+
+
+# -------------------------------------------------- eval
+
+ROWS = {  # the table: figure -> label, factor, digits
+    "seconds": ("flight time, s", 1, 2), "steps": ("flight time, steps", 1, 1),
+    "over_random": ("over random, %", 100, 0), "crossed": ("crossed, %", 100, 1),
+    "progress": ("progress, m", 1, 1), "crash": ("crashed, %", 100, 1),
+    "goal": ("arrived, %", 100, 1), "left": ("left the forest, %", 100, 1),
+    "time": ("out of time, %", 100, 1), "return": ("return", 1, 1),
+}  # fmt: skip
+
+
+def evaluate(args: argparse.Namespace) -> None:
+    """Fly every pilot through the same forests; print the table, write pictures and JSON."""
+    world, rng = World(beacon=args.beacon), np.random.default_rng(0)
+    seeds = range(args.first_seed, args.first_seed + args.episodes)
+    pilots = {"straight": straight_pilot, "laser": laser_pilot, "dqn": dqn_pilot(args.q)}
+    bar = fly_random(seeds, world, rng)
+    flights = {p: bar if p == "random" else fly(p, pilots[p], seeds, world) for p in args.pilots}
+    figures = {p: summarize(flights[p], bar, len(seeds), rng) for p in flights}
+    print(f"{len(seeds)} forests from seed {seeds[0]}; the random pilot flies {len(bar):,} times\n")
+    print_table(figures)
+    draw_pictures(flights, seeds, world, args.out)
+    if args.json:
+        head = {"weights": str(args.weights), "beacon": args.beacon, "first_seed": seeds[0]}
+        report = {p: figures[p] | {"flights": flights[p]} for p in flights}
+        args.json.write_text(json.dumps(head | {"forests": len(seeds), "pilots": report}) + "\n")
+
+
+def summarize(
+    flights: Sequence[dict], bar: Sequence[dict], forests: int, rng: np.random.Generator
+) -> dict[str, dict[str, float]]:
+    """Every figure with its 95 % interval: value, low, high.
+
+    Means are bootstrapped over forests, for flights through one forest are no independent draws;
+    shares have Wilson intervals.
+    """
+    table, random_steps = measure(flights), per_forest(measure(bar)["steps"], forests)
+    draws = rng.integers(forests, size=(2000, forests))  # resampled forests
+    figures = {}
+    for key in ("steps", "progress", "return"):
+        x = per_forest(table[key], forests)
+        figures[key] = interval(x.mean(), x[draws].mean(1))
+    steps = per_forest(table["steps"], forests)
+    ratios = steps[draws].mean(1) / random_steps[draws].mean(1)
+    figures["over_random"] = interval(steps.mean() / random_steps.mean() - 1, ratios - 1)
+    figures["seconds"] = {k: v * World.dt for k, v in figures["steps"].items()}
+    for key in ("crossed", *OUTCOMES):
+        figures[key] = wilson(int(table[key].sum()), len(flights))
+    return figures
+
+
+def per_forest(values: np.ndarray, forests: int) -> np.ndarray:
+    """Mean of the flights through each forest (F,), which repeat in the same order."""
+    return values.reshape(-1, forests).mean(0)
+
+
+def interval(value: float, resampled: np.ndarray) -> dict[str, float]:
+    """A figure and the middle 95 % of its bootstrap."""
+    low, high = np.percentile(resampled, [2.5, 97.5])
+    return {"value": float(value), "low": float(low), "high": float(high)}
+
+
+def wilson(hits: int, n: int) -> dict[str, float]:
+    """A share and its 95 % interval by Wilson's score [Wilson 1927].
+
+    >>> {key: round(x, 3) for key, x in wilson(10, 10).items()}
+    {'value': 1.0, 'low': 0.722, 'high': 1.0}
+    """
+    z, p = 1.96, hits / n
+    middle = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return {"value": p, "low": max(middle - half, 0.0), "high": min(middle + half, 1.0)}
+
+
+def print_table(figures: dict[str, dict]) -> None:
+    """One row a figure, one column a pilot, 95 % intervals in brackets."""
+    print(f"{'':20}" + "".join(f"{name:>26}" for name in figures))
+    for key, (label, factor, digits) in ROWS.items():
+        cells = ""
+        for pilot in figures.values():
+            value, low, high = (
+                f"{factor * pilot[key][k]:.{digits}f}" for k in ("value", "low", "high")
+            )
+            cells += f"{value + ' [' + low + ', ' + high + ']':>26}"
+        print(f"{label:20}{cells}")
+
+
+def draw_pictures(
+    flights: dict[str, Sequence[dict]], seeds: Sequence[int], world: World, out: Path
+) -> None:
+    """flights.png: every pilot in the first four forests; flight.gif: the last pilot in the first."""
+    size, maps = (world.length, world.width), []
+    for i, seed in enumerate(seeds[:4]):
+        tracks = [(track(f[i], world), f[i]["outcome"], name) for name, f in flights.items()]
+        maps.append(render.draw_map(plant(seed, world), size, tracks, f"forest {seed}"))
+    render.draw_sheet(maps).save(out / "flights.png")
+    shown = list(flights.values())[-1][0]
+    frames = [step[0][-1] for step in refly(shown["seed"], map(int, shown["actions"]), world)]
+    trunks, path = plant(shown["seed"], world), track(shown, world)
+    pictures = render.film(frames, path, trunks, size, shown["outcome"], f"forest {shown['seed']}")
+    render.save_gif(out / "flight.gif", pictures, round(1000 * world.dt))
+    print(f"\nwrote {out / 'flights.png'} and {out / 'flight.gif'}")
+
+
+def track(flight: dict, world: World) -> np.ndarray:
+    """Where a flight went (T + 1, 2) in m, by flying it again."""
+    steps = refly(flight["seed"], map(int, flight["actions"]), world, camera=False)
+    return np.array([info["pose"][:2] for *_, info in steps])
+
+
+# -------------------------------------------------- command line
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse, but a bad command line gets one line instead of the whole usage."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, and no more."""
+        self.exit(2, f"{self.prog}: error: {message}\n")
+
+
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Read the command line; every field of Config is a flag of `train`."""
+    parser = Parser(prog="deepflight.py", description=__doc__.splitlines()[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
+    sub.add_argument("--preset", choices=PRESETS, default="default", help="default or mnih")
+    sub.add_argument("--name", default="", help="of the folder in runs/; without it a fresh number")
+    for f in fields(Config):
+        kind = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type}
+        text = f"{f.metadata['help']} (default: {f.default})"
+        sub.add_argument("--" + f.name.replace("_", "-"), help=text, **kind)
+    sub = commands.add_parser("eval", help="fly trained weights against three other pilots")
+    names = ("random", "straight", "laser", "dqn")
+    sub.add_argument("--weights", type=Path, help="default: weights/paper.pt or weights/beacon.pt")
+    sub.add_argument("--pilots", nargs="+", choices=names, default=names, help="which to show")
+    sub.add_argument("--episodes", type=int, default=100, help="forests, the same for every pilot")
+    sub.add_argument("--first-seed", type=int, default=EVAL_SEED, help="of the first forest")
+    sub.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
+    sub.add_argument("--json", type=Path, metavar="FILE", help="write every figure and flight")
+    sub.add_argument("--out", type=Path, default="runs/eval", help="folder of the pictures")
+    return parser.parse_args(argv)
+
+
+def prepare_train(args: argparse.Namespace) -> Callable[[], None]:
+    """Check everything and make the run's folder, before anything flies."""
+    given = {f.name: getattr(args, f.name) for f in fields(Config) if hasattr(args, f.name)}
+    c = Config(**(PRESETS[args.preset] | given))
+    if c.precision == "auto":
+        c = replace(c, precision="bfloat16" if BFLOAT16 else "float32")
+    if c.device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device is 'cuda', but torch finds none here: use cpu")
+    if args.name != Path(args.name).name:
+        raise ValueError(f"name is {args.name!r}, allowed is the name of one folder in runs/")
+    numbers = (Path(f"runs/{i:03d}") for i in itertools.count(1))
+    folder = Path("runs") / args.name if args.name else next(p for p in numbers if not p.exists())
+    if folder.exists():
+        raise ValueError(f"{folder} exists and is never overwritten: choose another name")
+    folder.mkdir(parents=True)
+    settings = {"preset": args.preset, "torch": torch.__version__} | asdict(c)
+    (folder / "config.json").write_text(json.dumps(settings, indent=2) + "\n")
+    return lambda: train(c, folder)
+
+
+def prepare_eval(args: argparse.Namespace) -> Callable[[], None]:
+    """Check everything and read the weights, before anything flies."""
+    if args.episodes < 1 or args.first_seed < 0:
+        given = f"episodes is {args.episodes} and first-seed {args.first_seed}"
+        raise ValueError(f"{given}, allowed: from 1 and from 0")
+    if args.json and (args.json.is_dir() or not args.json.absolute().parent.is_dir()):
+        raise ValueError(f"{args.json} cannot be written: it needs an existing folder")
+    if not args.weights:
+        name = "beacon.pt" if args.beacon else "paper.pt"
+        args.weights = Path(__file__).parent / "weights" / name
+    args.q = load_weights(args.weights, args.beacon) if "dqn" in args.pilots else None
+    args.out.mkdir(parents=True, exist_ok=True)
+    return lambda: evaluate(args)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; bad input is one line and exit code 2."""
+    args = parse(argv)
+    try:
+        job = (prepare_train if args.command == "train" else prepare_eval)(args)
+    except (ValueError, OSError) as error:
+        print(f"deepflight.py {args.command}: error: {error}", file=sys.stderr)
+        return 2
+    try:
+        job()
+    except KeyboardInterrupt:
+        print("\ninterrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,219 @@
+"""The experiment: pilots, statistics, the two commands, and whether the shipped pilot can fly."""
+
+import csv
+import json
+import math
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import deepflight
+from deepflight import MNIH, Config, dynamic_window, fly, fly_random, interval, laser_pilot, wilson
+from dqn import QNetwork
+from env import World, refly
+
+ROOT = Path(__file__).parent.parent
+WORLD = World()
+OPEN = (np.linspace(0, 2 * math.pi, 360, endpoint=False), np.full(360, 20.0))  # a scan of nothing
+
+
+def command(*words: object, folder: Path) -> subprocess.CompletedProcess:
+    """Run the real command line in a folder of its own."""
+    line = [sys.executable, str(ROOT / "deepflight.py"), *map(str, words)]
+    return subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
+
+
+# -------------------------------------------------- pilots
+
+
+def test_in_the_open_the_laser_pilot_turns_to_the_goal() -> None:
+    assert dynamic_window(*OPEN, 0.0, WORLD) == 4
+    assert dynamic_window(*OPEN, 2.0, WORLD) == 8
+    assert dynamic_window(*OPEN, -2.0, WORLD) == 0
+    assert dynamic_window(*OPEN, 0.35 * 1.5, WORLD) == 6  # 0.35 rad/s for 1.5 s
+
+
+def test_the_laser_pilot_turns_away_from_a_trunk_ahead() -> None:
+    bearings, distances = OPEN[0], OPEN[1].copy()
+    distances[:12] = 4.0  # bark from dead ahead to 12 degrees left
+    assert dynamic_window(bearings, distances, 0.0, WORLD) < 4
+    assert dynamic_window(bearings, np.roll(distances, -11), 0.0, WORLD) > 4
+
+
+def test_the_laser_pilot_arrives_and_never_crashes() -> None:
+    flights = fly("laser", laser_pilot, range(2 * 10**9, 2 * 10**9 + 20), WORLD)
+    assert not any(f["outcome"] == "crash" for f in flights)
+    assert sum(f["outcome"] == "goal" for f in flights) >= 17
+
+
+def test_the_random_pilot_draws_its_actions_uniformly() -> None:
+    flights = fly_random([5, 6], WORLD, np.random.default_rng(0))
+    assert len(flights) == 2000
+    assert [f["seed"] for f in flights[:4]] == [5, 6, 5, 6]
+    actions = "".join(f["actions"] for f in flights)
+    shares = np.array([actions.count(str(a)) for a in range(9)]) / len(actions)
+    assert shares == pytest.approx(1 / 9, abs=0.006)  # four standard errors of 40,000 draws
+
+
+def test_flights_do_not_depend_on_who_flies_beside_them() -> None:
+    alone = [fly("laser", laser_pilot, [seed], WORLD)[0] for seed in (1, 2, 3)]
+    assert fly("laser", laser_pilot, [1, 2, 3], WORLD) == alone
+
+
+# -------------------------------------------------- statistics
+
+
+def test_wilson_is_the_interval_whose_ends_are_1_96_standard_errors_away() -> None:
+    for hits, n in ((0, 10), (3, 20), (50, 100), (500, 500)):
+        figure = wilson(hits, n)
+        for end in (figure["low"], figure["high"]):
+            if 0 < end < 1:
+                z = (hits / n - end) / math.sqrt(end * (1 - end) / n)
+                assert abs(z) == pytest.approx(1.96)
+
+
+def test_the_bootstrap_finds_the_normal_interval_of_a_mean() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(10, 3, 400)
+    figure = interval(x.mean(), x[rng.integers(400, size=(2000, 400))].mean(1))
+    assert figure["high"] - figure["low"] == pytest.approx(2 * 1.96 * x.std() / 20, rel=0.1)
+
+
+# -------------------------------------------------- settings
+
+
+def test_the_mnih_preset_is_extended_data_table_1() -> None:
+    c = Config(**MNIH)
+    assert (c.steps, c.replay, c.warmup, c.batch) == (1_400_000, 1_000_000, 50_000, 32)
+    assert (c.epsilon_start, c.epsilon_final, c.epsilon_decay) == (1.0, 0.1, 1_000_000)
+    assert (c.update_every, c.target_every, c.gamma) == (4, 10_000, 0.99)
+    assert (c.optimizer, c.lr, c.lr_final, c.optimizer_eps) == ("rmsprop", 2.5e-4, 2.5e-4, 0.01)
+    assert (c.n, c.double, c.mirror, c.goal_value) == (1, False, False, 0.0)
+
+
+def test_training_test_and_evaluation_forests_are_three_disjoint_ranges() -> None:
+    tests = range(deepflight.TEST_SEED, deepflight.TEST_SEED + 10_000)  # at most, by Config
+    assert deepflight.TRAIN_SEEDS <= tests[0]
+    assert tests[-1] < deepflight.EVAL_SEED
+
+
+BAD = [
+    "train --preset ppo",
+    "train --batch 0",
+    "train --batch many",
+    "train --gamma 1.5",
+    "train --gamma nan",
+    "train --epsilon-final -0.1",
+    "train --optimizer sgd",
+    "train --replay 10",
+    "train --warmup 20 --lanes 8",
+    "train --name a/b",
+    "train --name ..",
+    "train --colour red",
+    "train --seed -1",
+    "eval --pilots laser pigeon",
+    "eval --episodes 0",
+    "eval --episodes -5",
+    "eval --first-seed -1",
+    "eval --weights nowhere.pt",
+    "eval --weights foreign.pt",
+    "eval --weights pickle.pt",
+    "eval --weights text.pt",
+    "eval --weights .",
+    "eval --json nowhere/x.json",
+    "eval --out text.pt",
+    "eval --beacon --weights paper.pt",
+    "fly",
+    "",
+]
+
+
+def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    torch.save({"weights": torch.zeros(3)}, tmp_path / "foreign.pt")
+    (tmp_path / "pickle.pt").write_bytes(pickle.dumps(subprocess.Popen))
+    (tmp_path / "text.pt").write_text("no weights")
+    deepflight.save_weights(tmp_path / "paper.pt", QNetwork(9), beacon=False)
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.chdir(tmp_path)
+    for line in BAD:
+        try:
+            code = deepflight.main(line.split())
+        except SystemExit as stop:  # argparse's way
+            code = stop.code
+        out, error = capsys.readouterr()
+        assert code == 2, line
+        assert error.count("\n") == 1, line
+        assert "error: " in error, line
+        assert not out, line
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+# -------------------------------------------------- train
+
+SHORT = "--steps 1200 --warmup 400 --test-every 400 --test-forests 4 --threads 1".split()
+
+
+def test_twenty_seconds_of_training_through_the_real_command_line(tmp_path: Path) -> None:
+    done = command("train", *SHORT, "--name", "first", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    run = tmp_path / "runs" / "first"
+    assert {p.name for p in run.iterdir()} == {"best.pt", "config.json", "log.csv", "timing.csv"}
+    assert json.loads((run / "config.json").read_text())["steps"] == 1200
+    with (run / "log.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["step"]) for row in rows] == [400, 800, 1200]
+    assert [int(row["updates"]) for row in rows] == [2, 102, 202]
+    for row in rows:
+        assert sum(float(row[f"test_{o}"]) for o in deepflight.OUTCOMES) == pytest.approx(1)
+        assert 0.98 < float(row["epsilon"]) < 1
+    deepflight.load_weights(run / "best.pt", beacon=False)
+    log = (run / "log.csv").read_bytes()
+
+    again = command("train", *SHORT, "--name", "first", folder=tmp_path)
+    assert again.returncode == 2, "an existing run is never overwritten"
+    assert (run / "log.csv").read_bytes() == log
+
+    command("train", *SHORT, folder=tmp_path)
+    assert (tmp_path / "runs/001/log.csv").read_bytes() == log, "same seed, same bytes"
+
+    command("train", *SHORT, "--seed", 1, folder=tmp_path)
+    assert (tmp_path / "runs/002/log.csv").read_bytes() != log, "another seed, another training"
+
+
+# -------------------------------------------------- eval
+
+
+def beats_the_papers_figure(weights: Path, folder: Path) -> bool:
+    """Whether the weights fly more than 180 % longer than random, by eval's own report."""
+    report = folder / f"{weights.stem}.json"
+    words = ["--weights", weights, "--pilots", "random", "dqn", "--episodes", 20, "--json", report]
+    done = command("eval", *words, folder=folder)
+    assert done.returncode == 0, done.stderr
+    return json.loads(report.read_text())["pilots"]["dqn"]["over_random"]["value"] > 1.8
+
+
+def test_the_shipped_pilot_beats_the_papers_180_percent(tmp_path: Path) -> None:
+    assert beats_the_papers_figure(ROOT / "weights/paper.pt", tmp_path)
+    assert {p.name for p in (tmp_path / "runs/eval").iterdir()} == {"flights.png", "flight.gif"}
+    pilots = json.loads((tmp_path / "paper.json").read_text())["pilots"]
+    assert len(pilots["random"]["flights"]) == 2000
+    for flight in pilots["dqn"]["flights"][:3] + pilots["random"]["flights"][:3]:
+        steps = list(refly(flight["seed"], map(int, flight["actions"]), WORLD, camera=False))
+        assert len(steps) == flight["steps"] + 1
+        assert steps[-1][-1]["outcome"] == flight["outcome"]
+        assert steps[-1][-1]["edge"] == flight["edge"]
+        assert steps[-1][-1]["progress"] == flight["progress"]
+        assert sum(step[1] for step in steps) == pytest.approx(flight["return"])
+
+
+def test_an_untrained_pilot_does_not(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    deepflight.save_weights(tmp_path / "untrained.pt", QNetwork(9), beacon=False)
+    assert not beats_the_papers_figure(tmp_path / "untrained.pt", tmp_path)
