@@ -391,17 +391,15 @@ def print_table(figures: dict[str, dict]) -> None:
     for key, (label, factor, digits) in ROWS.items():
         cells = ""
         for pilot in figures.values():
-            value, low, high = (
-                f"{factor * pilot[key][k]:.{digits}f}" for k in ("value", "low", "high")
-            )
-            cells += f"{value + ' [' + low + ', ' + high + ']':>26}"
+            value, low, high = (f"{factor * x:.{digits}f}" for x in pilot[key].values())
+            cells += f"{f'{value} [{low}, {high}]':>26}"
         print(f"{label:20}{cells}")
 
 
 def draw_pictures(
     flights: dict[str, Sequence[dict]], seeds: Sequence[int], world: World, out: Path
 ) -> None:
-    """flights.png: every pilot in the first four forests; flight.gif: the last pilot in the first."""
+    """Draw every pilot in the first four forests, and film the last pilot in the first."""
     size, maps = (world.length, world.width), []
     for i, seed in enumerate(seeds[:4]):
         tracks = [(track(f[i], world), f[i]["outcome"], name) for name, f in flights.items()]
@@ -463,7 +461,7 @@ def prepare_train(args: argparse.Namespace) -> Callable[[], None]:
         c = replace(c, precision="bfloat16" if BFLOAT16 else "float32")
     if c.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device is 'cuda', but torch finds none here: use cpu")
-    if args.name != Path(args.name).name:
+    if args.name != Path(args.name).name or args.name.startswith("."):
         raise ValueError(f"name is {args.name!r}, allowed is the name of one folder in runs/")
     numbers = (Path(f"runs/{i:03d}") for i in itertools.count(1))
     folder = Path("runs") / args.name if args.name else next(p for p in numbers if not p.exists())

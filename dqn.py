@@ -30,7 +30,6 @@ end how the window ended; y the target; B batch, T rows and L lanes of the repla
 Not in this file: prioritized replay, distributional values, noisy layers.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -107,17 +106,7 @@ class Replay:
         self.rows, self.lanes = shape
         self.added = 0  # rows ever written
 
-    def __len__(self) -> int:
-        return min(self.added, self.rows) * self.lanes
-
-    def add(
-        self,
-        s: np.ndarray,
-        a: np.ndarray,
-        r: Sequence[float],
-        s2: Sequence[np.ndarray],
-        end: Sequence[int],
-    ) -> None:
+    def add(self, s: np.ndarray, a: np.ndarray, r: list, s2: list, end: list) -> None:
         """Write one transition a lane (line 11): s, s2 (L, 4, 84, 84), a, r, end (L,)."""
         row = self.added % self.rows
         self.frames[row], self.actions[row] = s[:, -1], a
