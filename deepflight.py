@@ -35,7 +35,7 @@ from env import OUTCOMES, ForestEnv, World, plant, refly
 TRAIN_SEEDS, TEST_SEED, EVAL_SEED = 10**9, 10**9, 2 * 10**9
 PRECISIONS = ("auto", "bfloat16", "float32")
 RANDOM_FLIGHTS = 2000  # with fewer the bar itself, random's mean flight, moves by 20 %
-BFLOAT16 = torch.cpu._is_avx512_bf16_supported()  # natively, or it would be slower than float32
+BFLOAT16 = torch.cpu.get_capabilities().get("avx512_bf16", False)  # else it would be slower
 
 
 def setting(default: Any, text: str, *allowed: Any) -> Any:
@@ -191,8 +191,8 @@ END = {"": LIVE, "crash": DEAD, "left": DEAD, "goal": GOAL, "time": CUT}
 COLUMNS = {  # what a status line shows: name in log.csv -> heading, format
     "step": ("step", "9,"), "episodes": ("episodes", "9,"), "epsilon": ("epsilon", "8.2f"),
     "speed": ("steps/s", "8.0f"), "left": ("min left", "9.1f"),
-    "train_return": ("| train: return", "15.1f"), "train_steps": ("steps", "7.1f"),
-    "test_return": ("| test: return", "14.1f"), "test_steps": ("steps", "7.1f"),
+    "train_return": (" | train: return", "16.1f"), "train_steps": ("steps", "7.1f"),
+    "test_return": (" | test: return", "15.1f"), "test_steps": ("steps", "7.1f"),
     "test_over_random": ("over random", "12.0%"), "test_progress": ("progress", "9.1f"),
     "test_crash": ("crash", "6.0%"), "test_goal": ("goal", "6.0%"),
     "test_left": ("left", "6.0%"), "test_time": ("time", "6.0%"),
@@ -212,6 +212,7 @@ def train(c: Config, folder: Path) -> None:
     for env in envs:
         env.reset(seed=int(flight_rng.integers(TRAIN_SEEDS)))  # lines 4, 5
     log, timing, recent, episodes, start = [], [], deque(maxlen=100), 0, time.perf_counter()
+    print(f"to {folder}, the best weights so far always in {folder / 'best.pt'}\n")
     print("".join(f"{head:>{len(format(0, form))}}" for head, form in COLUMNS.values()))
     for step in range(c.lanes, c.steps + c.lanes, c.lanes):  # line 6
         eps = linear(step, c.epsilon_start, c.epsilon_final, c.epsilon_decay)
@@ -224,7 +225,7 @@ def train(c: Config, folder: Path) -> None:
         row = {"step": step, "episodes": episodes, "updates": agent.updates, "epsilon": eps}
         row |= {f"train_{key}": mean(recent, key) for key in ("return", "steps")}
         seconds = time.perf_counter() - start
-        speed = {"speed": step / seconds, "left": (c.steps - step) * seconds / step / 60}
+        speed = {"speed": step / seconds, "left": max(c.steps - step, 0) * seconds / step / 60}
         live(status(row | speed))
         if times_due(step, c.lanes, c.test_every) or step >= c.steps:
             log.append(row | test(agent.q, test_seeds, world, bar))

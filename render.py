@@ -200,7 +200,11 @@ def film(
         ended = outcome if t == len(frames) else ""
         chart = draw_map(trunks, size, [(path[:t], ended, ended)], title)
         chart = chart.resize((chart.width // 2, chart.height // 2), Image.Resampling.BILINEAR)
-        eye = Image.fromarray(frame).resize((chart.height, chart.height)).convert("RGB")
+        eye = (
+            Image.fromarray(frame)
+            .resize((chart.height, chart.height), Image.Resampling.NEAREST)
+            .convert("RGB")
+        )
         both = Image.new("RGB", (eye.width + chart.width, chart.height))
         both.paste(eye, (0, 0))
         both.paste(chart, (eye.width, 0))
