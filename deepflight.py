@@ -19,6 +19,7 @@ import math
 import pickle
 import sys
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -29,7 +30,7 @@ import numpy as np
 import torch
 
 import render
-from dqn import CUT, DEAD, DQN, GOAL, LIVE, QNetwork, Replay, greedy, linear
+from dqn import DEAD, DQN, FAR, GOAL, LIVE, TRUNCATED, QNetwork, Replay, greedy, linear_schedule
 from env import OUTCOMES, ForestEnv, World, plant, refly
 
 TRAIN_SEEDS, TEST_SEED, EVAL_SEED = 10**9, 10**9, 2 * 10**9
@@ -57,7 +58,8 @@ class Config:
     gamma: float = setting(0.99, "discount a step [DF II-A]", 0, 1)
     n: int = setting(5, "rewards in a return before the bootstrap", 1, 100)
     double: bool = setting(True, "let Q choose the action that the target network values", 0, 1)
-    goal_value: float = setting(100.0, "of arrival in the target: 1 a step for ever", -INF, INF)
+    goal_value: float = setting(125.0, "of arrival in the target: 1.25 a step for ever", -INF, INF)
+    far_value: float = setting(50.0, "of leaving by the far edge in the target", -INF, INF)
     mirror: bool = setting(True, "reflect half of every batch left to right", 0, 1)
     batch: int = setting(32, "transitions an update [Mnih15]", 1, 10_000)
     update_every: int = setting(4, "control steps an update [Mnih15]", 1, INF)
@@ -68,8 +70,8 @@ class Config:
     epsilon_final: float = setting(0.05, "share of random actions in the end", 0, 1)
     epsilon_decay: int = setting(40_000, "control steps from first to final", 1, INF)
     optimizer: str = setting("adam", "adam, or Mnih's rmsprop", "adam", "rmsprop")
-    lr: float = setting(1e-4, "learning rate at first", 0, 1)
-    lr_final: float = setting(1e-5, "and in the end, linear between", 0, 1)
+    lr: float = setting(2.5e-4, "learning rate at first", 0, 1)
+    lr_final: float = setting(2.5e-5, "and in the end, linear between", 0, 1)
     optimizer_eps: float = setting(1.5e-4, "the optimizer's epsilon", 0, 1)
     max_grad_norm: float = setting(10.0, "longer gradients are cut to this; 0: never", 0, INF)
     precision: str = setting("auto", "of the convolutions; auto: bfloat16 if native", *PRECISIONS)
@@ -95,10 +97,10 @@ class Config:
 
 # [Mnih15, Extended Data Table 1], as the paper says [DF II-B]; 1.4 M steps are the paper's own
 MNIH = dict(
-    steps=1_400_000, n=1, double=False, goal_value=0.0, mirror=False, target_every=10_000,
-    replay=1_000_000, warmup=50_000, epsilon_final=0.1, epsilon_decay=1_000_000,
-    optimizer="rmsprop", lr=2.5e-4, lr_final=2.5e-4, optimizer_eps=0.01, max_grad_norm=0.0,
-    precision="float32", test_every=20_000,
+    steps=1_400_000, n=1, double=False, goal_value=0.0, far_value=0.0, mirror=False,
+    target_every=10_000, replay=1_000_000, warmup=50_000, epsilon_final=0.1,
+    epsilon_decay=1_000_000, optimizer="rmsprop", lr=2.5e-4, lr_final=2.5e-4, optimizer_eps=0.01,
+    max_grad_norm=0.0, precision="float32", test_every=20_000,
 )  # fmt: skip
 PRESETS = {"default": {}, "mnih": MNIH}
 
@@ -148,16 +150,18 @@ def dqn_pilot(q: QNetwork) -> Pilot:
     return lambda envs: greedy(q, np.stack([env.observation for env in envs]))
 
 
-def fly(name: str, pilot: Pilot, seeds: Sequence[int], world: World) -> list[dict]:
+def fly(
+    name: str, pilot: Pilot, seeds: Sequence[int], world: World, camera: bool = True
+) -> list[dict]:
     """Fly one forest a seed, a hundred at once; returns the flights in the order of the seeds."""
     flights = []
     for group in (seeds[i : i + 100] for i in range(0, len(seeds), 100)):
-        envs = [ForestEnv(world, camera=name == "dqn") for _ in group]
+        envs = [ForestEnv(world, camera=camera) for _ in group]
         for env, seed in zip(envs, group, strict=True):
             env.reset(seed=seed)
         while flying := [env for env in envs if not env.outcome]:
             landed = len(flights) + len(envs) - len(flying)
-            live(f"{name}: {landed:,} of {len(seeds):,} flights have landed")
+            show(f"{name}: {landed:,} of {len(seeds):,} flights have landed")
             for env, a in zip(flying, pilot(flying), strict=True):
                 env.step(a)
         flights += [env.flight() for env in envs]
@@ -167,7 +171,7 @@ def fly(name: str, pilot: Pilot, seeds: Sequence[int], world: World) -> list[dic
 def fly_random(seeds: Sequence[int], world: World, rng: np.random.Generator) -> list[dict]:
     """The bar: 2,000 random flights or more, equally many through each forest."""
     repeats = math.ceil(RANDOM_FLIGHTS / len(seeds))
-    return fly("random", random_pilot(rng), list(seeds) * repeats, world)
+    return fly("random", random_pilot(rng), list(seeds) * repeats, world, camera=False)
 
 
 def measure(flights: Sequence[dict]) -> dict[str, np.ndarray]:
@@ -187,10 +191,18 @@ def mean(flights: Sequence[dict], key: str) -> float:
 
 # -------------------------------------------------- train
 
-END = {"": LIVE, "crash": DEAD, "left": DEAD, "goal": GOAL, "time": CUT}
-COLUMNS = {  # what a status line shows: name in log.csv -> heading, format
+END = {
+    "": LIVE,
+    "crash": DEAD,
+    "side": DEAD,
+    "back": DEAD,
+    "far": FAR,
+    "goal": GOAL,
+    "time": TRUNCATED,
+}
+COLUMNS = {  # a status line: key -> heading, format; log.csv has all but the clock's speed and eta
     "step": ("step", "9,"), "episodes": ("episodes", "9,"), "epsilon": ("epsilon", "8.2f"),
-    "speed": ("steps/s", "8.0f"), "left": ("min left", "9.1f"),
+    "speed": ("steps/s", "8.0f"), "eta": ("min left", "9.1f"),
     "train_return": (" | train: return", "16.1f"), "train_steps": ("steps", "7.1f"),
     "test_return": (" | test: return", "15.1f"), "test_steps": ("steps", "7.1f"),
     "test_over_random": ("over random", "12.0%"), "test_progress": ("progress", "9.1f"),
@@ -211,29 +223,30 @@ def train(c: Config, folder: Path) -> None:
     envs = [ForestEnv(world) for _ in range(c.lanes)]
     for env in envs:
         env.reset(seed=int(flight_rng.integers(TRAIN_SEEDS)))  # lines 4, 5
+    aim = "test_goal" if c.beacon else "test_crossed"  # what chooses the best weights
     log, timing, recent, episodes, start = [], [], deque(maxlen=100), 0, time.perf_counter()
     print(f"to {folder}, the best weights so far always in {folder / 'best.pt'}\n")
     print("".join(f"{head:>{len(format(0, form))}}" for head, form in COLUMNS.values()))
     for step in range(c.lanes, c.steps + c.lanes, c.lanes):  # line 6
-        eps = linear(step, c.epsilon_start, c.epsilon_final, c.epsilon_decay)
+        eps = linear_schedule(step, c.epsilon_start, c.epsilon_final, c.epsilon_decay)
         landed = interact(envs, agent.q, eps, memory, flight_rng)
         recent.extend(landed)
         episodes += len(landed)
-        lr = linear(step, c.lr, c.lr_final, c.steps)
+        lr = linear_schedule(step, c.lr, c.lr_final, c.steps)
         for _ in range(times_due(step, c.lanes, c.update_every) if step >= c.warmup else 0):
             agent.learn(memory, lr, batch_rng)
         row = {"step": step, "episodes": episodes, "updates": agent.updates, "epsilon": eps}
         row |= {f"train_{key}": mean(recent, key) for key in ("return", "steps")}
         seconds = time.perf_counter() - start
-        speed = {"speed": step / seconds, "left": max(c.steps - step, 0) * seconds / step / 60}
-        live(status(row | speed))
+        speed = {"speed": step / seconds, "eta": max(c.steps - step, 0) * seconds / step / 60}
+        show(status(row | speed))
         if times_due(step, c.lanes, c.test_every) or step >= c.steps:
-            log.append(row | test(agent.q, test_seeds, world, bar))
+            log.append(row | greedy_test(agent.q, test_seeds, world, bar))
             timing.append({"step": step, "seconds": round(time.perf_counter() - start, 1)})
             print(status(log[-1] | speed), flush=True)
             write_csv(folder / "log.csv", log)
             write_csv(folder / "timing.csv", timing)
-            if log[-1]["test_progress"] == max(past["test_progress"] for past in log):
+            if max(log, key=lambda past: (past[aim], past["test_progress"])) is log[-1]:
                 save_weights(folder / "best.pt", agent.q, c.beacon)
 
 
@@ -247,7 +260,7 @@ def interact(
     a = np.where(explore, rng.integers(actions, size=lanes), greedy(q, s))  # (L,) line 8
     steps = [env.step(action) for env, action in zip(envs, a.tolist(), strict=True)]  # lines 9, 10
     s2, r = [step[0] for step in steps], [step[1] for step in steps]
-    memory.add(s, a, r, s2, [END[env.outcome] for env in envs])  # line 11
+    memory.add(s, a, r, s2, [END[env.edge or env.outcome] for env in envs])  # line 11
     over = [env for env in envs if env.outcome]
     flights = [env.flight() for env in over]
     for env in over:
@@ -269,14 +282,14 @@ def status(row: dict) -> str:
     return "".join(format(row[key], form) for key, (_, form) in COLUMNS.items() if key in row)
 
 
-def test(q: QNetwork, seeds: Sequence[int], world: World, bar: float) -> dict[str, float]:
+def greedy_test(q: QNetwork, seeds: Sequence[int], world: World, bar: float) -> dict[str, float]:
     """Means over the greedy policy's flights through the test forests."""
     flights = measure(fly("dqn", dqn_pilot(q), seeds, world))
     row = {f"test_{key}": float(values.mean()) for key, values in flights.items()}
     return row | {"test_over_random": row["test_steps"] / bar - 1}
 
 
-def live(text: str) -> None:
+def show(text: str) -> None:
     """Show a passing status on a terminal; nothing when piped."""
     if sys.stdout.isatty():
         print(f"\r{text}\x1b[K\r", end="", flush=True)
@@ -299,7 +312,8 @@ def save_weights(path: Path, q: QNetwork, beacon: bool) -> None:
 def load_weights(path: Path, beacon: bool) -> QNetwork:
     """Read what save_weights wrote; never runs code from the file. Raises ValueError."""
     try:
-        saved = torch.load(path, weights_only=True)
+        with warnings.catch_warnings(action="ignore"):  # torch has views on foreign pickles
+            saved = torch.load(path, weights_only=True)
         trained_with = saved["beacon"]
         q = QNetwork(World.actions)
         q.load_state_dict(saved["network"])
@@ -325,6 +339,7 @@ ROWS = {  # the table: figure -> label, factor, digits
 
 def evaluate(args: argparse.Namespace) -> None:
     """Fly every pilot through the same forests; print the table, write pictures and JSON."""
+    torch.set_num_threads(Config.threads)
     world, rng = World(beacon=args.beacon), np.random.default_rng(0)
     seeds = range(args.first_seed, args.first_seed + args.episodes)
     pilots = {"straight": straight_pilot, "laser": laser_pilot, "dqn": dqn_pilot(args.q)}
@@ -346,15 +361,13 @@ def summarize(
     """Every figure with its 95 % interval: value, low, high.
 
     Means are bootstrapped over forests, for flights through one forest are no independent draws;
-    shares have Wilson intervals.
+    shares have Wilson's interval, which is exact for one flight a forest.
     """
     table, random_steps = measure(flights), per_forest(measure(bar)["steps"], forests)
     draws = rng.integers(forests, size=(2000, forests))  # resampled forests
-    figures = {}
-    for key in ("steps", "progress", "return"):
-        x = per_forest(table[key], forests)
-        figures[key] = interval(x.mean(), x[draws].mean(1))
-    steps = per_forest(table["steps"], forests)
+    means = {key: per_forest(table[key], forests) for key in ("steps", "progress", "return")}
+    figures = {key: interval(x.mean(), x[draws].mean(1)) for key, x in means.items()}
+    steps = means["steps"]
     ratios = steps[draws].mean(1) / random_steps[draws].mean(1)
     figures["over_random"] = interval(steps.mean() / random_steps.mean() - 1, ratios - 1)
     figures["seconds"] = {k: v * World.dt for k, v in figures["steps"].items()}
@@ -407,16 +420,19 @@ def draw_pictures(
         maps.append(render.draw_map(plant(seed, world), size, tracks, f"forest {seed}"))
     render.draw_sheet(maps).save(out / "flights.png")
     shown = list(flights.values())[-1][0]
-    frames = [step[0][-1] for step in refly(shown["seed"], map(int, shown["actions"]), world)]
-    trunks, path = plant(shown["seed"], world), track(shown, world)
-    pictures = render.film(frames, path, trunks, size, shown["outcome"], f"forest {shown['seed']}")
-    render.save_gif(out / "flight.gif", pictures, round(1000 * world.dt))
+    trunks, path, title = plant(shown["seed"], world), track(shown, world), f"forest {seeds[0]}"
+    growing = [
+        (path[:t], "" if t < len(path) else shown["outcome"], "") for t in range(1, len(path) + 1)
+    ]
+    maps = [render.draw_map(trunks, size, [part], title) for part in growing]
+    frames = [step[0][-1] for step in refly(shown["seed"], shown["actions"], world)]
+    render.save_gif(out / "flight.gif", render.film(frames, maps), round(1000 * world.dt))
     print(f"\nwrote {out / 'flights.png'} and {out / 'flight.gif'}")
 
 
 def track(flight: dict, world: World) -> np.ndarray:
     """Where a flight went (T + 1, 2) in m, by flying it again."""
-    steps = refly(flight["seed"], map(int, flight["actions"]), world, camera=False)
+    steps = refly(flight["seed"], flight["actions"], world, camera=False)
     return np.array([info["pose"][:2] for *_, info in steps])
 
 

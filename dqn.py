@@ -25,8 +25,8 @@ the code below and the training loop in deepflight.py carry these numbers.
     17  end for
 
 Legend: s, a state and action; r the sum of the next n discounted rewards (n = 1: the reward);
-s2 the state after them; gamma the discount, here already raised to the number of rewards in r;
-end how the window ended; y the target; B batch, T rows and L lanes of the replay.
+s2 the state after them; gamma the discount of a step, discount that of s2: gamma to the number of
+rewards in r; end how these ended; y the target; B batch, T rows and L lanes of the replay.
 Not in this file: prioritized replay, distributional values, noisy layers.
 """
 
@@ -37,9 +37,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-# How a transition ended: not at all, in a terminal state worth nothing, in one worth `goal_value`,
-# or cut short by a time limit, after which the world would have gone on.
-LIVE, DEAD, GOAL, CUT = range(4)
+# How a transition ended: not at all; cut short by a time limit, after which the world would have
+# gone on; or in a terminal state: a dead one, the goal, or the far side that is nearly the goal.
+LIVE, TRUNCATED, DEAD, GOAL, FAR = range(5)
 
 
 class QNetwork(nn.Module):
@@ -47,13 +47,13 @@ class QNetwork(nn.Module):
 
     def __init__(self, actions: int) -> None:
         super().__init__()
-        self.see = nn.Sequential(
+        self.conv = nn.Sequential(
             *(nn.Conv2d(4, 32, 8, 4), nn.ReLU()),  # (B, 32, 20, 20)
             *(nn.Conv2d(32, 64, 4, 2), nn.ReLU()),  # (B, 64, 9, 9)
             *(nn.Conv2d(64, 64, 3, 1), nn.ReLU()),  # (B, 64, 7, 7)
             nn.Flatten(),  # (B, 3136)
         )
-        self.judge = nn.Sequential(nn.Linear(3136, 512), nn.ReLU(), nn.Linear(512, actions))
+        self.head = nn.Sequential(nn.Linear(3136, 512), nn.ReLU(), nn.Linear(512, actions))
 
     def forward(self, s: Tensor, bfloat16: bool = False) -> Tensor:
         """Q(s, .) (B, actions) float32 of s (B, 4, 84, 84) uint8.
@@ -62,8 +62,8 @@ class QNetwork(nn.Module):
         float32: between 64 and 128 bfloat16 moves in steps of 0.5 and the actions would tie.
         """
         with torch.autocast(s.device.type, torch.bfloat16, enabled=bfloat16):
-            seen = self.see(s.float() / 255)  # (B, 3136)
-        return self.judge(seen.float())  # (B, actions)
+            seen = self.conv(s.float() / 255)  # (B, 3136)
+        return self.head(seen.float())  # (B, actions)
 
 
 @torch.no_grad()
@@ -79,8 +79,8 @@ class Batch(NamedTuple):
     s: np.ndarray  # (B, 4, 84, 84) uint8
     a: np.ndarray  # (B,) int64
     r: np.ndarray  # (B,) float32, the window's discounted rewards
-    s2: np.ndarray  # (B, 4, 84, 84) uint8, meaningless after DEAD and GOAL
-    gamma: np.ndarray  # (B,) float32, to the power of the window's length
+    s2: np.ndarray  # (B, 4, 84, 84) uint8, meaningless after DEAD, GOAL and FAR
+    discount: np.ndarray  # (B,) float32, gamma to the number of rewards in r
     end: np.ndarray  # (B,) uint8
 
 
@@ -101,8 +101,8 @@ class Replay:
         self.frames = np.empty((*shape, 84, 84), np.uint8)  # (T, L, 84, 84)
         self.actions = np.zeros(shape, np.uint8)  # (T, L)
         self.rewards = np.zeros(shape, np.float32)  # (T, L)
-        self.ends = np.full(shape, DEAD, np.uint8)  # (T, L) nothing precedes the first row
-        self.last_frames: dict[tuple[int, int], np.ndarray] = {}  # of s2, for CUT alone
+        self.ends = np.zeros(shape, np.uint8)  # (T, L)
+        self.last_frames: dict[tuple[int, int], np.ndarray] = {}  # of s2, for TRUNCATED alone
         self.rows, self.lanes = shape
         self.added = 0  # rows ever written
 
@@ -113,15 +113,13 @@ class Replay:
         self.rewards[row], self.ends[row] = r, end
         for lane in range(self.lanes):
             self.last_frames.pop((row, lane), None)
-            if end[lane] == CUT:
+            if end[lane] == TRUNCATED:
                 self.last_frames[row, lane] = s2[lane][-1].copy()
         self.added += 1
 
     def sample(self, size: int, n: int, gamma: float, rng: np.random.Generator) -> Batch:
-        """Draw transitions uniformly (line 12) from all whose stack and window are complete.
-
-        The three oldest rows may have lost the frames before them, the n newest wait for theirs.
-        """
+        """Draw transitions uniformly (line 12) from all but the oldest three rows, which may have
+        lost the frames before them, and the newest n, which wait for the rewards after them."""
         oldest = max(self.added - self.rows, 0) + 3
         row = rng.integers(oldest, self.added - n, size) % self.rows  # (B,)
         lane = rng.integers(self.lanes, size=size)  # (B,)
@@ -137,7 +135,7 @@ class Replay:
             r = r + live * power * self.rewards[last, lane]
         end = self.ends[last, lane]  # (B,)
         s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), lane)
-        for i in np.flatnonzero(end == CUT):
+        for i in np.flatnonzero(end == TRUNCATED):
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], lane[i]]]
         a = self.actions[row, lane].astype(np.int64)
         return Batch(self.stack(row, lane), a, r, s2, power * np.float32(gamma), end)
@@ -163,26 +161,26 @@ def mirror(batch: Batch, flip: np.ndarray, actions: int) -> Batch:
 
 
 def td_target(
-    r: Tensor, gamma: Tensor, end: Tensor, choose: Tensor, value: Tensor, goal_value: float
+    r: Tensor, discount: Tensor, end: Tensor, choose: Tensor, value: Tensor, worth: dict[int, float]
 ) -> Tensor:
     """The Bellman target y (B,) of line 13: r + gamma * max_a Q^(s2, a), until the episode ends.
 
-    r, gamma, end (B,). choose and value (B, actions) are action values at s2: those that choose a2
-    and those that say what it is worth. DQN takes both from Q^; Double DQN lets Q choose, for the
-    maximum of noisy values flatters them [van Hasselt 2016]. Only a true ending stops the
-    bootstrap: dead states are worth nothing, the goal goal_value, a time limit ends nothing.
+    r, discount, end (B,). choose and value (B, actions) are action values at s2: those that choose
+    a2 and those that say what it is worth. DQN takes both from Q^; Double DQN lets Q choose, for
+    the maximum of noisy values flatters them [van Hasselt 2016]. worth says what each kind of
+    terminal state counts for; only those stop the bootstrap, for a time limit ends nothing.
     """
     a2 = choose.argmax(1, keepdim=True)  # (B, 1)
     v2 = value.gather(1, a2)[:, 0]  # (B,)
-    v2 = torch.where(end == DEAD, 0.0, v2)
-    v2 = torch.where(end == GOAL, goal_value, v2)
-    return r + gamma * v2
+    for terminal, v in worth.items():
+        v2 = torch.where(end == terminal, v, v2)
+    return r + discount * v2
 
 
-def linear(step: int, first: float, final: float, steps: int) -> float:
+def linear_schedule(step: int, first: float, final: float, steps: int) -> float:
     """The schedule of epsilon and the learning rate: from first to final in steps, then constant.
 
-    >>> [linear(t, 1.0, 0.1, 100) for t in (0, 50, 100, 1000)]
+    >>> [linear_schedule(t, 1.0, 0.1, 100) for t in (0, 50, 100, 1000)]
     [1.0, 0.55, 0.1, 0.1]
     """
     return final + (first - final) * max(1 - step / steps, 0)
@@ -194,24 +192,25 @@ class DQN:
     def __init__(self, settings: Any, actions: int, seed: int) -> None:
         self.settings, self.actions, self.updates = settings, actions, 0
         with torch.random.fork_rng():  # torch draws initial weights from its global generator:
-            torch.manual_seed(seed)  # lend it our seed and put its own state back
+            torch.manual_seed(seed % 2**64)  # lend it our seed and put its own state back
             self.q = QNetwork(actions).to(settings.device)  # line 2
             self.q_target = QNetwork(actions).to(settings.device)
         self.q_target.load_state_dict(self.q.state_dict())  # line 3
         self.optimizer = make_optimizer(self.q, settings)
+        self.worth = {DEAD: 0.0, GOAL: settings.goal_value, FAR: settings.far_value}
 
-    def learn(self, memory: Replay, lr: float, rng: np.random.Generator) -> float:
-        """One gradient step on a batch from memory (lines 12 to 15); returns its loss."""
+    def learn(self, memory: Replay, lr: float, rng: np.random.Generator) -> None:
+        """One gradient step on a batch from memory (lines 12 to 15)."""
         c = self.settings
         batch = memory.sample(c.batch, c.n, c.gamma, rng)
         if c.mirror:
             batch = mirror(batch, rng.random(c.batch) < 0.5, self.actions)
-        s, a, r, s2, gamma, end = (torch.from_numpy(x).to(c.device) for x in batch)
+        s, a, r, s2, discount, end = (torch.from_numpy(x).to(c.device) for x in batch)
         fast = c.precision == "bfloat16"
         with torch.no_grad():
             value = self.q_target(s2, fast)  # (B, actions)
             choose = self.q(s2, fast) if c.double else value  # (B, actions)
-            y = td_target(r, gamma, end, choose, value, c.goal_value)  # (B,)
+            y = td_target(r, discount, end, choose, value, self.worth)  # (B,)
         q = self.q(s, fast).gather(1, a[:, None])[:, 0]  # (B,)
         loss = F.smooth_l1_loss(q, y)  # Huber: Mnih's error clipping to [-1, 1]
         self.optimizer.param_groups[0]["lr"] = lr
@@ -223,7 +222,6 @@ class DQN:
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.q_target.load_state_dict(self.q.state_dict())  # line 15
-        return loss.item()
 
 
 def make_optimizer(q: QNetwork, c: Any) -> torch.optim.Optimizer:

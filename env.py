@@ -16,10 +16,11 @@
     | too close                       | r_neg = 0 falling to r_precrash = -5       | 2.0 - 0.75 m |
     | and always, the way to the goal | r_goal = 1 - d_goal / d_max                |              |
     | crash, or out of the forest     | r_crash = -10 and nothing else; the end    | < 0.75 m     |
+    | arrival, or out of time         | as on every live step; the end             | any          |
 
-Legend: d_obs is the distance from the drone's centre to the nearest bark, d_goal to the goal; SI
-units. A flight is a deterministic function of its seed and its actions: keep those two and you can
-fly it again, frame by frame (`refly`).
+Legend: d_obs is the distance from the drone's centre to the nearest bark, at most the laser's 20 m,
+d_goal that to the goal; SI units. A flight is a deterministic function of its seed and its actions:
+keep those two and you can fly it again, frame by frame (`refly`).
 
 Not in this file: rotors, wind, inertia, altitude. `ForestEnv` has Gymnasium's signatures
 without needing gymnasium.
@@ -136,7 +137,7 @@ class ForestEnv:
         self.drone = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self.space.add(self.drone)
         self.actions: list[int] = []
-        self.progress, self.total, self.outcome = 0.0, 0.0, ""
+        self.progress, self.total, self.outcome, self.edge = 0.0, 0.0, "", ""
         self._measure()
         self.observation = np.repeat(self._look()[None], STACK, 0)  # (4, 84, 84)
         return self.observation, self._info()
@@ -151,11 +152,11 @@ class ForestEnv:
             raise ValueError(f"step needs a flight in the air, this one is {self.outcome}: reset")
         if action not in range(self.world.actions):
             raise ValueError(f"action is {action!r}, allowed are 0 to {self.world.actions - 1}")
+        self.actions.append(int(action))
         self._move(self.world.yaw_rate * (2 * int(action) / (self.world.actions - 1) - 1))
         self._measure()
         self.outcome = self._judge()
         r = reward(self.outcome, self.d_obs, self.d_goal, self.world)
-        self.actions.append(int(action))
         self.total += r
         self.observation = np.concatenate([self.observation[1:], self._look()[None]])
         truncated = self.outcome == "time"
@@ -181,13 +182,13 @@ class ForestEnv:
             "seed": self.seed,
             "actions": "".join(map(str, self.actions)),
             "outcome": self.outcome,
-            "edge": self.edge() if self.outcome == "left" else "",
+            "edge": self.edge,
             "steps": len(self.actions),
             "progress": self.progress,
             "return": self.total,
         }
 
-    def edge(self) -> str:
+    def _edge(self) -> str:
         """The edge the drone is beyond: far, back or side, or "" inside the forest."""
         x, y = self.drone.position
         if x > self.world.length:
@@ -214,9 +215,10 @@ class ForestEnv:
             return "crash"
         if self.d_goal < self.world.goal_radius:
             return "goal"
-        if self.edge():
+        self.edge = self._edge()
+        if self.edge:
             return "left"
-        return "time" if len(self.actions) + 1 >= self.world.max_steps else ""
+        return "time" if len(self.actions) >= self.world.max_steps else ""
 
     def _look(self) -> np.ndarray:
         if not self.has_camera:
@@ -228,16 +230,19 @@ class ForestEnv:
         pose = (*self.drone.position, self.drone.angle)
         info = {"d_obs": self.d_obs, "d_goal": self.d_goal, "pose": pose}
         if self.outcome:
-            info |= {key: self.flight()[key] for key in ("outcome", "edge", "progress")}
+            info |= {"outcome": self.outcome, "edge": self.edge, "progress": self.progress}
         return info
 
 
 def refly(
-    seed: int, actions: Iterable[int], world: World, *, camera: bool = True
+    seed: int, actions: Iterable[int] | str, world: World, *, camera: bool = True
 ) -> Iterator[tuple[np.ndarray, float, bool, bool, dict]]:
-    """Fly a recorded flight again: yields what `step` returned, the reset (reward 0) first."""
+    """Fly a recorded flight again: yields what `step` returned, the reset (reward 0) first.
+
+    actions: numbers, or the digits that `ForestEnv.flight` writes.
+    """
     env = ForestEnv(world, camera=camera)
     observation, info = env.reset(seed=seed)
     yield observation, 0.0, False, False, info
     for action in actions:
-        yield env.step(action)
+        yield env.step(int(action))

@@ -46,13 +46,13 @@ class Scene:
     trunk_radius: float = 0.5  # m, authors' simulator
     trunk_height: float = 6.0  # m, authors' simulator
     altitude: float = 2.0  # m, of the eye, authors' simulator
-    view: float = 40.0  # m, how far the camera sees; all below and the greys: ours
+    view: float = 40.0  # m, how far the camera sees: ours, as all below
     beacon_height: float = 20.0  # m
     beacon_radius: float = 1.0  # m
     beacon_pixels: float = 3.0  # px, never drawn narrower than this
-    sky: int = 160
-    ground: int = 110
-    trunk_facing: int = 70  # bark seen head-on
+    sky: int = 90
+    ground: int = 60
+    trunk_facing: int = 35  # bark seen head-on
     trunk_grazing: int = 0  # bark seen edge-on
     beacon_grey: int = 255
 
@@ -146,7 +146,6 @@ def draw_map(
     size: tuple[float, float],
     flights: Iterable[tuple[np.ndarray, str, str]],
     title: str = "",
-    radius: float = Scene.trunk_radius,
 ) -> Image.Image:
     """Draw a forest from above, x to the right and y up.
 
@@ -165,7 +164,7 @@ def draw_map(
     draw = ImageDraw.Draw(image)
     draw.rectangle([*pixel(0, width / 2), *pixel(length, -width / 2)], fill="#f2f2ea")
     for x, y in trunks:
-        disc(x, y, radius, "#5b5b50")
+        disc(x, y, Scene.trunk_radius, "#5b5b50")
     disc(0, 0, 0.8, "#1f77b4")
     disc(length, 0, 1.6, "#2ca02c")
     for path, outcome, label in flights:
@@ -186,28 +185,14 @@ def draw_sheet(maps: Sequence[Image.Image]) -> Image.Image:
     return sheet
 
 
-def film(
-    frames: Sequence[np.ndarray],
-    path: np.ndarray,
-    trunks: np.ndarray,
-    size: tuple[float, float],
-    outcome: str,
-    title: str = "",
-) -> list[Image.Image]:
-    """Show the camera's frames (T of (84, 84)) beside the map on which the path (T, 2) grows."""
+def film(frames: Iterable[np.ndarray], maps: Iterable[Image.Image]) -> list[Image.Image]:
+    """Put the camera's frames (T of (84, 84)) beside T maps, at half the maps' size."""
     pictures = []
-    for t, frame in enumerate(frames, 1):
-        ended = outcome if t == len(frames) else ""
-        chart = draw_map(trunks, size, [(path[:t], ended, ended)], title)
-        chart = chart.resize((chart.width // 2, chart.height // 2), Image.Resampling.BILINEAR)
-        eye = (
-            Image.fromarray(frame)
-            .resize((chart.height, chart.height), Image.Resampling.NEAREST)
-            .convert("RGB")
-        )
-        both = Image.new("RGB", (eye.width + chart.width, chart.height))
-        both.paste(eye, (0, 0))
-        both.paste(chart, (eye.width, 0))
+    for frame, chart in zip(frames, maps, strict=True):
+        width, height = chart.width // 2, chart.height // 2
+        both = Image.new("RGB", (height + width, height))
+        both.paste(Image.fromarray(frame).resize((height, height), Image.Resampling.NEAREST))
+        both.paste(chart.resize((width, height), Image.Resampling.BILINEAR), (height, 0))
         pictures.append(both.quantize(64, dither=Image.Dither.NONE))
     return pictures
 

@@ -13,7 +13,17 @@ import pytest
 import torch
 
 import deepflight
-from deepflight import MNIH, Config, dynamic_window, fly, fly_random, interval, laser_pilot, wilson
+from deepflight import (
+    MNIH,
+    Config,
+    dynamic_window,
+    fly,
+    fly_random,
+    interval,
+    laser_pilot,
+    summarize,
+    wilson,
+)
 from dqn import QNetwork
 from env import World, refly
 
@@ -60,11 +70,6 @@ def test_the_random_pilot_draws_its_actions_uniformly() -> None:
     assert shares == pytest.approx(1 / 9, abs=0.006)  # four standard errors of 40,000 draws
 
 
-def test_flights_do_not_depend_on_who_flies_beside_them() -> None:
-    alone = [fly("laser", laser_pilot, [seed], WORLD)[0] for seed in (1, 2, 3)]
-    assert fly("laser", laser_pilot, [1, 2, 3], WORLD) == alone
-
-
 # -------------------------------------------------- statistics
 
 
@@ -84,6 +89,22 @@ def test_the_bootstrap_finds_the_normal_interval_of_a_mean() -> None:
     assert figure["high"] - figure["low"] == pytest.approx(2 * 1.96 * x.std() / 20, rel=0.1)
 
 
+def test_the_figures_of_two_forests_by_hand() -> None:
+    ended = {"progress": 10.0, "return": -1.0, "outcome": "crash", "edge": ""}
+    bar = [ended | {"steps": n} for n in (10, 30, 20, 40)]  # forests A, B, A, B: 15 and 35 steps
+    far = {"progress": 90.0, "return": 9.0, "outcome": "left", "edge": "far"}
+    flights = [ended | {"steps": 30}, far | {"steps": 170}]
+    figures = summarize(flights, bar, 2, np.random.default_rng(0))
+    # Resampling two forests gives A twice, B twice or one of each: ratios 2, 34/7 and 4.
+    assert figures["over_random"] == pytest.approx({"value": 3.0, "low": 1.0, "high": 27 / 7})
+    assert figures["steps"] == {"value": 100.0, "low": 30.0, "high": 170.0}
+    assert figures["seconds"] == pytest.approx({"value": 10.0, "low": 3.0, "high": 17.0})
+    shares = {key: figures[key]["value"] for key in ("crossed", "crash", "left", "goal", "time")}
+    assert shares == {"crossed": 0.5, "crash": 0.5, "left": 0.5, "goal": 0.0, "time": 0.0}
+    same = summarize(bar, bar, 2, np.random.default_rng(0))["over_random"]
+    assert same == {"value": 0.0, "low": 0.0, "high": 0.0}
+
+
 # -------------------------------------------------- settings
 
 
@@ -93,7 +114,8 @@ def test_the_mnih_preset_is_extended_data_table_1() -> None:
     assert (c.epsilon_start, c.epsilon_final, c.epsilon_decay) == (1.0, 0.1, 1_000_000)
     assert (c.update_every, c.target_every, c.gamma) == (4, 10_000, 0.99)
     assert (c.optimizer, c.lr, c.lr_final, c.optimizer_eps) == ("rmsprop", 2.5e-4, 2.5e-4, 0.01)
-    assert (c.n, c.double, c.mirror, c.goal_value) == (1, False, False, 0.0)
+    assert (c.n, c.double, c.mirror) == (1, False, False)
+    assert (c.goal_value, c.far_value) == (0.0, 0.0)
 
 
 def test_training_test_and_evaluation_forests_are_three_disjoint_ranges() -> None:
@@ -205,12 +227,18 @@ def test_the_shipped_pilot_beats_the_papers_180_percent(tmp_path: Path) -> None:
     pilots = json.loads((tmp_path / "paper.json").read_text())["pilots"]
     assert len(pilots["random"]["flights"]) == 2000
     for flight in pilots["dqn"]["flights"][:3] + pilots["random"]["flights"][:3]:
-        steps = list(refly(flight["seed"], map(int, flight["actions"]), WORLD, camera=False))
+        steps = list(refly(flight["seed"], flight["actions"], WORLD, camera=False))
         assert len(steps) == flight["steps"] + 1
         assert steps[-1][-1]["outcome"] == flight["outcome"]
         assert steps[-1][-1]["edge"] == flight["edge"]
         assert steps[-1][-1]["progress"] == flight["progress"]
         assert sum(step[1] for step in steps) == pytest.approx(flight["return"])
+
+
+def test_the_shipped_beacon_pilot_flies_in_its_own_world_only() -> None:
+    deepflight.load_weights(ROOT / "weights/beacon.pt", beacon=True)
+    with pytest.raises(ValueError, match="trained with the beacon"):
+        deepflight.load_weights(ROOT / "weights/beacon.pt", beacon=False)
 
 
 def test_an_untrained_pilot_does_not(tmp_path: Path) -> None:
