@@ -87,12 +87,10 @@ class Config:
             if not legal:
                 text = " or ".join(allowed) if f.type is str else "{:g} to {:g}".format(*allowed)
                 raise ValueError(f"{f.name} is {value}, allowed: {text}")
-        rows, least = min(self.replay, self.warmup) // self.lanes, self.n + 4
-        if rows < least:
-            raise ValueError(
-                f"replay is {self.replay} and warmup {self.warmup}, "
-                f"allowed: at least lanes * (n + 4) = {self.lanes * least} each"
-            )
+        least = self.lanes * (self.n + 4)  # a stack, a window, and the row after it
+        if min(self.replay, self.warmup) < least:
+            given = f"replay is {self.replay} and warmup {self.warmup}"
+            raise ValueError(f"{given}, allowed: at least lanes * (n + 4) = {least} each")
 
 
 # [Mnih15, Extended Data Table 1], as the paper says [DF II-B]; 1.4 M steps are the paper's own
