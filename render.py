@@ -54,7 +54,7 @@ class Scene:
     ground: int = 60
     trunk_facing: int = 35  # bark seen head-on
     trunk_grazing: int = 0  # bark seen edge-on
-    beacon_grey: int = 255
+    beacon_grey: int = 140  # clear, but no more: pilots shun a white pole as they shun bark
 
 
 def raycast(

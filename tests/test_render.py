@@ -148,7 +148,7 @@ def test_the_beacon_is_three_pixels_wide_from_across_the_forest() -> None:
         pole = camera(EYE, 0.0, np.empty((0, 2)), SCENE, beacon=(90.0, left)) == SCENE.beacon_grey
         assert 3 <= pole.any(0).sum() <= 4
         assert pole[:42].any(1).sum() == pytest.approx(FOCAL * 18 / 90, abs=1.1)
-    assert min(abs(SCENE.beacon_grey - g) for g in (SCENE.sky, SCENE.trunk_facing)) > 64
+    assert min(abs(SCENE.beacon_grey - g) for g in (SCENE.sky, SCENE.trunk_facing)) >= 50
 
 
 def test_the_beacon_is_hidden_by_nearer_trunks_and_hides_farther_ones() -> None:
