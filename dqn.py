@@ -202,7 +202,7 @@ class DQN:
     def learn(self, memory: Replay, lr: float, rng: np.random.Generator) -> None:
         """One gradient step on a batch from memory (lines 12 to 15)."""
         c = self.settings
-        batch = memory.sample(c.batch, c.n, c.gamma, rng)
+        batch = memory.sample(c.batch, c.n, c.gamma, rng)  # line 12
         if c.mirror:
             batch = mirror(batch, rng.random(c.batch) < 0.5, self.actions)
         s, a, r, s2, discount, end = (torch.from_numpy(x).to(c.device) for x in batch)
@@ -210,9 +210,9 @@ class DQN:
         with torch.no_grad():
             value = self.q_target(s2, fast)  # (B, actions)
             choose = self.q(s2, fast) if c.double else value  # (B, actions)
-            y = td_target(r, discount, end, choose, value, self.worth)  # (B,)
+            y = td_target(r, discount, end, choose, value, self.worth)  # (B,) line 13
         q = self.q(s, fast).gather(1, a[:, None])[:, 0]  # (B,)
-        loss = F.smooth_l1_loss(q, y)  # Huber: Mnih's error clipping to [-1, 1]
+        loss = F.smooth_l1_loss(q, y)  # line 14; Huber, which is Mnih's error clipping to [-1, 1]
         self.optimizer.param_groups[0]["lr"] = lr
         self.optimizer.zero_grad()
         loss.backward()
