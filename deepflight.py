@@ -7,7 +7,7 @@
     python deepflight.py eval --beacon          fly weights/beacon.pt where the goal is visible
 
 Seeds: training plants forests from [0, 10^9), test points choose weights on [10^9, 2 * 10^9), and
-`eval` flies from 2 * 10^9 on, so no forest that shaped or chose the weights is ever evaluated.
+`eval` flies from 2 * 10^9 on unless told otherwise: forests that neither shaped nor chose weights.
 Not in this file: anything about pictures (render.py), flying (env.py) or learning (dqn.py).
 """
 
@@ -33,10 +33,11 @@ import render
 from dqn import DEAD, DQN, FAR, GOAL, LIVE, TRUNCATED, QNetwork, Replay, greedy, linear_schedule
 from env import OUTCOMES, ForestEnv, World, plant, refly
 
-TRAIN_SEEDS, TEST_SEED, EVAL_SEED = 10**9, 10**9, 2 * 10**9
+TRAIN_END, TEST_FIRST, EVAL_FIRST = 10**9, 10**9, 2 * 10**9  # forest seeds
 PRECISIONS = ("auto", "bfloat16", "float32")
-RANDOM_FLIGHTS = 2000  # with fewer the bar itself, random's mean flight, moves by 20 %
-BFLOAT16 = torch.cpu.get_capabilities().get("avx512_bf16", False)  # else it would be slower
+RANDOM_FLIGHTS = 2000  # a hundred would move the bar itself, random's mean flight, by a fifth
+# Without native support bfloat16 is slower than float32.
+BFLOAT16 = torch.cpu.get_capabilities().get("avx512_bf16", False)
 
 
 def setting(default: Any, text: str, *allowed: Any) -> Any:
@@ -212,13 +213,13 @@ def train(c: Config, folder: Path) -> None:
     torch.set_num_threads(c.threads)
     world = World(beacon=c.beacon)
     flight_rng, batch_rng, bar_rng = np.random.default_rng(c.seed).spawn(3)
-    test_seeds = range(TEST_SEED, TEST_SEED + c.test_forests)
+    test_seeds = range(TEST_FIRST, TEST_FIRST + c.test_forests)
     bar = measure(fly_random(test_seeds, world, bar_rng))["steps"].mean()
     memory = Replay(c.replay, c.lanes)  # line 1
     agent = DQN(c, world.actions, c.seed)  # lines 2, 3
     envs = [ForestEnv(world) for _ in range(c.lanes)]
     for env in envs:
-        env.reset(seed=int(flight_rng.integers(TRAIN_SEEDS)))  # lines 4, 5
+        env.reset(seed=int(flight_rng.integers(TRAIN_END)))  # lines 4, 5
     aim = "test_goal" if c.beacon else "test_crossed"  # what chooses the best weights
     log, timing, recent, episodes, start = [], [], deque(maxlen=100), 0, time.perf_counter()
     print(f"to {folder}, the best weights so far always in {folder / 'best.pt'}\n")
@@ -260,7 +261,7 @@ def interact(
     over = [env for env in envs if env.outcome]
     flights = [env.flight() for env in over]
     for env in over:
-        env.reset(seed=int(rng.integers(TRAIN_SEEDS)))  # lines 4, 5
+        env.reset(seed=int(rng.integers(TRAIN_END)))  # lines 4, 5
     return flights
 
 
@@ -357,7 +358,7 @@ def summarize(
     """Every figure with its 95 % interval: value, low, high.
 
     Means are bootstrapped over forests, for flights through one forest are no independent draws;
-    shares have Wilson's interval, which is exact for one flight a forest.
+    shares have Wilson's interval, which takes flights as independent: one flight a forest is.
     """
     table, random_steps = measure(flights), per_forest(measure(bar)["steps"], forests)
     draws = rng.integers(forests, size=(2000, forests))  # resampled forests
@@ -412,24 +413,23 @@ def draw_pictures(
     """Draw every pilot in the first four forests, and film the last pilot in the first."""
     size, maps = (world.length, world.width), []
     for i, seed in enumerate(seeds[:4]):
-        tracks = [(track(f[i], world), f[i]["outcome"], name) for name, f in flights.items()]
+        tracks = [(*track(f[i], world), name) for name, f in flights.items()]
         maps.append(render.draw_map(plant(seed, world), size, tracks, f"forest {seed}"))
     render.draw_sheet(maps).save(out / "flights.png")
     shown = list(flights.values())[-1][0]
-    trunks, path, title = plant(shown["seed"], world), track(shown, world), f"forest {seeds[0]}"
-    growing = [
-        (path[:t], "" if t < len(path) else shown["outcome"], "") for t in range(1, len(path) + 1)
-    ]
+    trunks, title, (path, ended) = plant(seeds[0], world), f"forest {seeds[0]}", track(shown, world)
+    growing = [(path[:t], "", "") for t in range(1, len(path))] + [(path, ended, "")]
     maps = [render.draw_map(trunks, size, [part], title) for part in growing]
     frames = [step[0][-1] for step in refly(shown["seed"], shown["actions"], world)]
     render.save_gif(out / "flight.gif", render.film(frames, maps), round(1000 * world.dt))
     print(f"\nwrote {out / 'flights.png'} and {out / 'flight.gif'}")
 
 
-def track(flight: dict, world: World) -> np.ndarray:
-    """Where a flight went (T + 1, 2) in m, by flying it again."""
+def track(flight: dict, world: World) -> tuple[np.ndarray, str]:
+    """Where a flight went (T + 1, 2) in m, by flying it again, and its edge or outcome."""
     steps = refly(flight["seed"], flight["actions"], world, camera=False)
-    return np.array([info["pose"][:2] for *_, info in steps])
+    path = np.array([info["pose"][:2] for *_, info in steps])
+    return path, flight["edge"] or flight["outcome"]
 
 
 # -------------------------------------------------- command line
@@ -459,7 +459,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     sub.add_argument("--weights", type=Path, help="default: weights/paper.pt or weights/beacon.pt")
     sub.add_argument("--pilots", nargs="+", choices=names, default=names, help="which to show")
     sub.add_argument("--episodes", type=int, default=100, help="forests, the same for every pilot")
-    sub.add_argument("--first-seed", type=int, default=EVAL_SEED, help="of the first forest")
+    sub.add_argument("--first-seed", type=int, default=EVAL_FIRST, help="of the first forest")
     sub.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write every figure and flight")
     sub.add_argument("--out", type=Path, default="runs/eval", help="folder of the pictures")

@@ -91,8 +91,8 @@ class Replay:
     drawn; keeping s and s2 whole would cost eight times as much. Row t, lane l holds the newest
     frame of s_t in environment l, the action taken there, its reward and how the transition ended.
 
-        lane 0   x x x # x x x x x x x           # an episode's end: no stack and no
-        lane 1   x x x x x x x # x x x             n-step window reaches across it,
+        lane 0   x x x|x x x x x x x x           | an episode's end: no stack and no
+        lane 1   x x x x x x x|x x x x             n-step window reaches across it,
                              ^ write position      nor across the write position
     """
 
@@ -150,9 +150,10 @@ class Replay:
 
 
 def mirror(batch: Batch, flip: np.ndarray, actions: int) -> Batch:
-    """Reflect the chosen transitions, flip (B,) bool, left to right: frames, and a -> 8 - a.
+    """Reflect the chosen transitions, flip (B,) bool: frames left to right, a -> actions - 1 - a.
 
-    Flight, reward and camera are symmetric, so the reflection is another true transition for free.
+    Flight, reward and camera are symmetric, so the reflection is another true transition for free;
+    only the forest's grid is not quite, being 0.5 m off centre.
     """
     for frames in (batch.s, batch.s2):
         frames[flip] = frames[flip, ..., ::-1]

@@ -20,6 +20,7 @@ plane, so a camera is 84 rays, a laser scanner is 360 rays, and one closed formu
     along the optical axis; the distance along the ray would bend straight walls.
 
 Legend: N trunks, M rays; metres, radians, grey levels 0 (black) to 255 (white).
+[DF] is the Deep Flight paper, [Mnih15] the Nature paper on DQN.
 Not in this file: textures, shadows, trunks that lean, a drone that climbs.
 """
 
@@ -54,7 +55,7 @@ class Scene:
     ground: int = 60
     trunk_facing: int = 35  # bark seen head-on
     trunk_grazing: int = 0  # bark seen edge-on
-    beacon_grey: int = 140  # clear, but no more: pilots shun a white pole as they shun bark
+    beacon_grey: int = 140  # clear, but no more: a white pole is shunned like bark
 
 
 def raycast(
@@ -112,7 +113,7 @@ def camera(
     """Draw what the drone sees: a frame (84, 84) uint8.
 
     eye: x, y in m. heading: rad, counter-clockwise from x. trunks (N, 2): centres in m.
-    beacon: where the goal's pole stands, or None where there is none.
+    beacon: where the goal's pole stands, or None where there is none; it shows from any distance.
     """
     cos, sin = math.cos(heading), math.sin(heading)
     to_body = np.array([[cos, -sin], [sin, cos]])  # (2, 2) x, y -> ahead, left
@@ -138,7 +139,7 @@ def camera(
 
 SCALE = 8  # px a metre on the map
 MARGIN = 4.0  # m around the forest
-COLOURS = {"crash": "#d62728", "goal": "#2ca02c", "left": "#ff7f0e", "time": "#1f77b4"}
+COLOURS = {"crash": "#d62728", "goal": "#2ca02c", "far": "#17a2b8", "": "#1f77b4"}  # else orange
 
 
 def draw_map(
@@ -150,7 +151,7 @@ def draw_map(
     """Draw a forest from above, x to the right and y up.
 
     trunks (N, 2): centres in m. size: the forest's length and width in m.
-    flights: (path (T, 2) in m, outcome or "" in the air, label) each, coloured by outcome.
+    flights: (path (T, 2) in m, how it ended or "" in the air, label) each, coloured by its end.
     """
     length, width = size
 
@@ -167,11 +168,12 @@ def draw_map(
         disc(x, y, Scene.trunk_radius, "#5b5b50")
     disc(0, 0, 0.8, "#1f77b4")
     disc(length, 0, 1.6, "#2ca02c")
-    for path, outcome, label in flights:
-        colour = COLOURS.get(outcome, "#1f77b4")
+    for i, (path, ended, label) in enumerate(flights):
+        colour = COLOURS.get(ended, "#ff7f0e")
         draw.line([pixel(x, y) for x, y in path], fill=colour, width=3)
         disc(*path[-1], 0.7, colour)
-        draw.text(pixel(path[-1][0] + 1, path[-1][1] + 1), label, fill=colour, font_size=18)
+        at, side = pixel(path[-1][0], path[-1][1] + 3 - 2 * i), "rm" if path[-1][0] > 75 else "lm"
+        draw.text(at, f" {label} ", fill=colour, font_size=18, anchor=side)
     draw.text((8, 4), title, fill="black", font_size=18)
     return image
 
@@ -193,7 +195,7 @@ def film(frames: Iterable[np.ndarray], maps: Iterable[Image.Image]) -> list[Imag
         both = Image.new("RGB", (height + width, height))
         both.paste(Image.fromarray(frame).resize((height, height), Image.Resampling.NEAREST))
         both.paste(chart.resize((width, height), Image.Resampling.BILINEAR), (height, 0))
-        pictures.append(both.quantize(64, dither=Image.Dither.NONE))
+        pictures.append(both.quantize(256, dither=Image.Dither.NONE))
     return pictures
 
 
