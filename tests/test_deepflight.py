@@ -121,7 +121,7 @@ def test_the_mnih_preset_is_extended_data_table_1() -> None:
 def test_training_test_and_evaluation_forests_are_three_disjoint_ranges() -> None:
     tests = range(deepflight.TEST_FIRST, deepflight.TEST_FIRST + 10_000)  # at most, by Config
     assert tests[0] >= deepflight.TRAIN_END
-    assert tests[-1] < deepflight.EVAL_SEED
+    assert tests[-1] < deepflight.EVAL_FIRST
 
 
 BAD = [
