@@ -29,15 +29,23 @@ without needing gymnasium.
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import pymunk
+from numpy import ndarray
 
 from render import PIXELS, Scene, camera, raycast
 
 STACK = 4  # frames in an observation [DF §II-A]
 OUTCOMES = ("crash", "goal", "left", "time")  # tested in this order
+
+
+# Least and most of a world's numbers that may be other than 0.001 to 10,000.
+LIMITS = dict.fromkeys(("first_x", "first_y", "r_safe", "r_precrash", "r_crash"), (-1e4, 1e4))
+LIMITS |= dict.fromkeys(("back", "jitter_x", "jitter_y", "beacon_pixels", "yaw_rate"), (0, 1e4))
+LIMITS |= dict.fromkeys(("sky", "ground", "trunk_facing", "trunk_grazing", "beacon_grey"), (0, 255))
+LIMITS |= {"rows": (0, 1e4), "columns": (0, 1e4), "beacon": (0, 1), "actions": (2, 10)}  # digits
 
 
 @dataclass(frozen=True)
@@ -71,21 +79,37 @@ class World(Scene):
     beacon: bool = False  # a pole at the goal makes it visible; off in the paper's world
 
     def __post_init__(self) -> None:
-        if not 0 < self.speed * self.dt < self.trunk_radius + self.d_crash:
-            reach = self.trunk_radius + self.d_crash
-            raise ValueError(
-                f"speed * dt is {self.speed * self.dt:g} m a step, allowed is above 0 and below "
-                f"trunk_radius + d_crash = {reach:g} m, or the drone could step over a trunk"
-            )
+        for f in fields(self):
+            value, (low, high) = getattr(self, f.name), LIMITS.get(f.name, (1e-3, 1e4))
+            if not (low <= value <= high and f.type(value) == value):
+                legal = f"{f.type.__name__} from {low:g} to {high:g}"
+                raise ValueError(f"{f.name} is {value}, allowed: {legal}")
+        reach, spread = self.trunk_radius + self.d_crash, (self.jitter_x, self.jitter_y)  # m
+        nearest = np.hypot(*np.maximum(np.abs(grid(self)) - spread, 0).T).min(initial=math.inf)
+        for small, big, rule in (
+            (self.speed * self.dt, reach, "speed * dt < trunk_radius + d_crash, to step over none"),
+            (reach, nearest, "trunk_radius + d_crash < the way from the start to any trunk"),
+            (2 * self.d_crash, self.width, "2 * d_crash < width"),
+            (self.d_crash, self.d_neg, "d_crash < d_neg"),
+        ):
+            if not small < big:
+                raise ValueError(f"a legal world has {rule}; here they are {small:g} and {big:g}")
 
 
-def plant(seed: int, world: World) -> np.ndarray:
-    """Trunk centres (N, 2) in m: a jittered grid, a function of the seed alone."""
+def grid(world: World) -> ndarray:
+    """Trunk centres (N, 2) in m before jitter."""
     x = world.first_x + world.spacing_x * np.arange(world.rows)
     y = world.first_y + world.spacing_y * np.arange(world.columns)
-    grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)  # (N, 2)
+    return np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)  # (N, 2)
+
+
+def plant(seed: int, world: World) -> ndarray:
+    """Trunk centres (N, 2) in m: a jittered grid, a function of the seed alone."""
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"seed is {seed!r}, allowed are integers from 0")
+    centres = grid(world)  # (N, 2)
     jitter = (world.jitter_x, world.jitter_y)
-    return grid + np.random.default_rng(seed).uniform(-1, 1, grid.shape) * jitter
+    return centres + np.random.default_rng(seed).uniform(-1, 1, centres.shape) * jitter
 
 
 def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
@@ -128,9 +152,7 @@ class ForestEnv:
         self.seed = -1  # none flown yet
         self.outcome = "not reset"
 
-    def reset(
-        self, *, seed: int | None = None, options: dict | None = None
-    ) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: object = None) -> tuple[ndarray, dict]:
         """Plant forest number `seed`, or the one after the last, and stand at the start.
 
         Draws nothing from anywhere: the forest is a function of the seed. `options` is unused.
@@ -147,7 +169,7 @@ class ForestEnv:
         self.observation = np.repeat(self._look()[None], STACK, 0)  # (4, 84, 84)
         return self.observation, self._info()
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(self, action: int) -> tuple[ndarray, float, bool, bool, dict]:
         """Turn at the action's yaw rate, fly one control step, look.
 
         Returns observation, reward, terminated, truncated, info. info holds d_obs and d_goal in m,
@@ -155,7 +177,7 @@ class ForestEnv:
         """
         if self.outcome:
             raise ValueError(f"step needs a flight in the air, this one is {self.outcome}: reset")
-        if action not in range(self.world.actions):
+        if not isinstance(action, int | np.integer) or not 0 <= action < self.world.actions:
             raise ValueError(f"action is {action!r}, allowed are 0 to {self.world.actions - 1}")
         self.actions.append(int(action))
         self._move(self.world.yaw_rate * (2 * int(action) / (self.world.actions - 1) - 1))
@@ -167,7 +189,7 @@ class ForestEnv:
         truncated = self.outcome == "time"
         return self.observation, r, bool(self.outcome) and not truncated, truncated, self._info()
 
-    def scan(self) -> tuple[np.ndarray, np.ndarray]:
+    def scan(self) -> tuple[ndarray, ndarray]:
         """The laser's beams: bearings from the heading (360,) rad, counter-clockwise from dead
         ahead, and distances (360,) m, 20 where nothing is hit."""
         bearings = np.arange(self.world.beams) * (2 * math.pi / self.world.beams)  # (360,)
@@ -183,24 +205,9 @@ class ForestEnv:
 
     def flight(self) -> dict:
         """The flight so far: seed and actions, which are all of it, and what came of them."""
-        return {
-            "seed": self.seed,
-            "actions": "".join(map(str, self.actions)),
-            "outcome": self.outcome,
-            "edge": self.edge,
-            "steps": len(self.actions),
-            "progress": self.progress,
-            "return": self.total,
-        }
-
-    def _edge(self) -> str:
-        """The edge the drone is beyond: far, back or side, or "" inside the forest."""
-        x, y = self.drone.position
-        if x > self.world.length:
-            return "far"
-        if x < -self.world.back:
-            return "back"
-        return "side" if abs(y) > self.world.width / 2 else ""
+        digits = "".join(map(str, self.actions))
+        flown = {"seed": self.seed, "actions": digits, "outcome": self.outcome, "edge": self.edge}
+        return flown | {"steps": len(digits), "progress": self.progress, "return": self.total}
 
     def _move(self, yaw_rate: float) -> None:
         heading = self.drone.angle + yaw_rate * self.world.dt  # turn first, then fly
@@ -220,12 +227,14 @@ class ForestEnv:
             return "crash"
         if self.d_goal < self.world.goal_radius:
             return "goal"
-        self.edge = self._edge()
+        x, y = self.drone.position
+        far, back, side = x > self.world.length, x < -self.world.back, abs(y) > self.world.width / 2
+        self.edge = "far" if far else "back" if back else "side" if side else ""
         if self.edge:
             return "left"
         return "time" if len(self.actions) >= self.world.max_steps else ""
 
-    def _look(self) -> np.ndarray:
+    def _look(self) -> ndarray:
         if not self.has_camera:
             return np.zeros((PIXELS, PIXELS), np.uint8)
         beacon = self.goal if self.world.beacon else None
@@ -239,9 +248,7 @@ class ForestEnv:
         return info
 
 
-def refly(
-    seed: int, actions: Iterable[int] | str, world: World, *, camera: bool = True
-) -> Iterator[tuple[np.ndarray, float, bool, bool, dict]]:
+def refly(seed: int, actions: Iterable, world: World, *, camera: bool = True) -> Iterator[tuple]:
     """Fly a recorded flight again: yields what `step` returned, the reset (reward 0) first.
 
     actions: numbers, or the digits that `ForestEnv.flight` writes.

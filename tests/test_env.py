@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, reject
+from hypothesis import strategies as st
 
 from env import ForestEnv, World, plant, refly, reward
 
@@ -201,12 +203,22 @@ def test_without_a_seed_the_next_forest_is_the_next_number() -> None:
     assert env.seed == 42
 
 
-@pytest.mark.parametrize("action", [-1, 9, 0.5, None, "4"])
+@pytest.mark.parametrize("action", [-1, 9, 0.5, 4.0, None, "4", [4], math.nan])
 def test_an_impossible_action_is_named(action: object) -> None:
     env = ForestEnv(camera=False)
     env.reset(seed=0)
     with pytest.raises(ValueError, match="allowed are 0 to 8"):
         env.step(action)
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, "7", [1]])
+def test_an_impossible_seed_is_named(seed: object) -> None:
+    with pytest.raises(ValueError, match="allowed are integers from 0"):
+        ForestEnv(camera=False).reset(seed=seed)
+
+
+def test_seeds_of_any_size_plant_a_forest() -> None:
+    assert len(plant(10**30, WORLD)) == 150
 
 
 def test_a_flight_that_is_over_or_not_begun_cannot_go_on() -> None:
@@ -218,7 +230,96 @@ def test_a_flight_that_is_over_or_not_begun_cannot_go_on() -> None:
         env.step(4)
 
 
-def test_a_drone_that_could_step_over_a_trunk_is_no_legal_world() -> None:
-    with pytest.raises(ValueError, match="step over"):
-        World(speed=13.0)
-    World(speed=12.0)
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"speed": 13.0}, "speed"),  # 1.3 m a step, over a trunk's middle
+        ({"dt": 0.3}, "dt"),
+        ({"speed": 0.0}, "speed"),
+        ({"speed": math.nan}, "speed"),
+        ({"dt": math.inf}, "dt"),
+        ({"trunk_radius": -0.5}, "trunk_radius"),
+        ({"trunk_radius": 0.0}, "trunk_radius"),
+        ({"first_x": 0.5, "first_y": -20.0}, "start"),  # a trunk at (0.5, 0)
+        ({"first_x": 1.8, "first_y": -20.0, "jitter_x": 0.6}, "start"),  # or one that may be
+        ({"width": 1.5}, "width"),  # no wider than the drone keeps away from bark
+        ({"length": -90.0}, "length"),
+        ({"rows": 1.5}, "rows"),
+        ({"columns": -1}, "columns"),
+        ({"actions": 1}, "actions"),
+        ({"actions": 11}, "actions"),
+        ({"jitter_y": -1.0}, "jitter_y"),
+        ({"d_neg": 0.5}, "d_neg"),
+        ({"sky": 256}, "sky"),
+        ({"max_steps": 0}, "max_steps"),
+    ],
+)
+def test_an_impossible_world_is_refused_by_the_name_of_what_is_wrong(
+    settings: dict, named: str
+) -> None:
+    with pytest.raises(ValueError, match=named):
+        World(**settings)
+
+
+# -------------------------------------------------- whatever the world, whatever the actions
+
+WORLDS = st.builds(
+    dict,
+    length=st.floats(5, 120),
+    width=st.floats(2, 60),
+    rows=st.integers(0, 12),
+    columns=st.integers(0, 8),
+    first_x=st.floats(-5, 20),
+    first_y=st.floats(-30, 5),
+    spacing_x=st.floats(0.5, 10),
+    spacing_y=st.floats(0.5, 10),
+    jitter_x=st.floats(0, 3),
+    jitter_y=st.floats(0, 3),
+    trunk_radius=st.floats(0.05, 2),
+    trunk_height=st.floats(0.1, 10),
+    altitude=st.floats(0.1, 8),
+    view=st.floats(1, 60),
+    speed=st.floats(0.1, 10),
+    yaw_rate=st.floats(0, 3),
+    goal_radius=st.floats(0.1, 5),
+    max_steps=st.integers(1, 40),
+    beacon=st.booleans(),
+)
+
+
+@given(WORLDS, st.integers(0, 2**70), st.lists(st.integers(0, 8), min_size=40, max_size=40))
+def test_in_every_legal_world_a_flight_keeps_the_rules(
+    settings: dict, seed: int, actions: list[int]
+) -> None:
+    try:
+        env = ForestEnv(World(**settings))
+    except ValueError:
+        reject()
+    keeps_the_rules(env, env.reset(seed=seed)[0], 0.0)
+    for action in actions:
+        if not env.outcome:
+            observation, r, terminated, truncated, _ = env.step(action)
+            assert truncated == (env.outcome == "time")
+            assert terminated == (env.outcome in ("crash", "goal", "left"))
+            keeps_the_rules(env, observation, r)
+
+
+def keeps_the_rules(env: ForestEnv, observation: np.ndarray, r: float) -> None:
+    """What the drone sees, earns and comes to agrees with where it is."""
+    world, (x, y) = env.world, env.drone.position
+    assert observation.shape == (4, 84, 84)
+    assert observation.dtype == np.uint8
+    assert all(map(math.isfinite, (r, x, y, env.drone.angle, env.d_obs, env.d_goal)))
+    to_bark = [math.dist((x, y), trunk) - world.trunk_radius for trunk in env.trunks.tolist()]
+    assert env.d_obs == pytest.approx(min([*to_bark, world.laser_range]), abs=1e-6)
+    assert env.d_goal == pytest.approx(math.dist((x, y), (world.length, 0)))
+    outside = x > world.length or x < -world.back or abs(y) > world.width / 2
+    crash, arrived = env.d_obs < world.d_crash, env.d_goal < world.goal_radius
+    late = len(env.actions) >= world.max_steps
+    expected = "crash" if crash else "goal" if arrived else "left" if outside else late and "time"
+    if env.actions:
+        assert env.outcome == (expected or "")
+        assert (env.edge != "") == (env.outcome == "left")
+        r_goal = 1 - env.d_goal / world.length
+        live = world.r_precrash + r_goal - 1e-9 <= r <= world.r_safe + r_goal + 1e-9
+        assert r == world.r_crash if env.outcome in ("crash", "left") else live
