@@ -12,32 +12,34 @@ Not in this file: anything about pictures (render.py), flying (env.py) or learni
 """
 
 import argparse
-import csv
 import itertools
 import json
 import math
-import pickle
+import shlex
+import signal
+import sqlite3
 import sys
 import time
-import warnings
-from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import torch
+from numpy import ndarray
 
+import dqn
 import render
-from dqn import DEAD, DQN, FAR, GOAL, LIVE, TRUNCATED, QNetwork, Replay, greedy, linear_schedule
+from dqn import DQN, QNetwork, Replay, greedy, linear_schedule, load, save, write_whole
 from env import OUTCOMES, ForestEnv, World, plant, refly
 
 TRAIN_END, TEST_FIRST, EVAL_FIRST = 10**9, 10**9, 2 * 10**9  # forest seeds
-PRECISIONS = ("auto", "bfloat16", "float32")
+CHECKPOINT = "checkpoint.pt"
+TORCH = str(torch.__version__)
 RANDOM_FLIGHTS = 2000  # a hundred would move the bar itself, random's mean flight, by a fifth
-# Without native support bfloat16 is slower than float32.
-BFLOAT16 = torch.cpu.get_capabilities().get("avx512_bf16", False)
+# Where the processor has no bfloat16 of its own, float32 is faster.
+PRECISION = "bfloat16" if torch.cpu.get_capabilities().get("avx512_bf16") else "float32"
 
 
 def setting(default: Any, text: str, *allowed: Any) -> Any:
@@ -45,41 +47,39 @@ def setting(default: Any, text: str, *allowed: Any) -> Any:
     return field(default=default, metadata={"help": text, "allowed": allowed})
 
 
-INF = math.inf
-
-
 @dataclass(frozen=True)
 class Config:
     """Every setting of a training; each is a flag of `train`."""
 
-    steps: int = setting(300_000, "control steps in all", 1, INF)
-    seed: int = setting(0, "of everything random", 0, INF)
+    steps: int = setting(300_000, "control steps in all", 1, math.inf)
+    seed: int = setting(0, "of everything random", 0, math.inf)
     beacon: bool = setting(False, "put a visible pole at the goal", 0, 1)
     lanes: int = setting(8, "drones flown at once, one forest each", 1, 1000)
     gamma: float = setting(0.99, "discount a step [DF II-A]", 0, 1)
     n: int = setting(5, "rewards in a return before the bootstrap", 1, 100)
     double: bool = setting(True, "let Q choose the action that the target network values", 0, 1)
-    goal_value: float = setting(125.0, "of arrival in the target: 1.25 a step for ever", -INF, INF)
-    far_value: float = setting(50.0, "of leaving by the far edge in the target", -INF, INF)
+    goal_value: float = setting(125.0, "of arrival in the target: 1.25 a step for ever", -1e6, 1e6)
+    far_value: float = setting(50.0, "of leaving by the far edge in the target", -1e6, 1e6)
     mirror: bool = setting(True, "reflect half of every batch left to right", 0, 1)
     batch: int = setting(32, "transitions an update [Mnih15]", 1, 10_000)
-    update_every: int = setting(4, "control steps an update [Mnih15]", 1, INF)
-    target_every: int = setting(500, "updates between copies to the target network", 1, INF)
-    replay: int = setting(200_000, "transitions remembered, 7.1 kB each", 1, INF)
-    warmup: int = setting(5_000, "control steps before the first update", 1, INF)
+    update_every: int = setting(4, "control steps an update [Mnih15]", 1, math.inf)
+    target_every: int = setting(500, "updates between copies to the target network", 1, math.inf)
+    replay: int = setting(200_000, "transitions remembered, 7.1 kB each", 1, math.inf)
+    warmup: int = setting(5_000, "control steps before the first update", 1, math.inf)
     epsilon_start: float = setting(1.0, "share of random actions at first [Mnih15]", 0, 1)
     epsilon_final: float = setting(0.05, "share of random actions in the end", 0, 1)
-    epsilon_decay: int = setting(40_000, "control steps from first to final", 1, INF)
+    epsilon_decay: int = setting(40_000, "control steps from first to final", 1, math.inf)
     optimizer: str = setting("adam", "adam, or Mnih's rmsprop", "adam", "rmsprop")
     lr: float = setting(2.5e-4, "learning rate at first", 0, 1)
     lr_final: float = setting(2.5e-5, "and in the end, linear between", 0, 1)
     optimizer_eps: float = setting(1.5e-4, "the optimizer's epsilon", 0, 1)
-    max_grad_norm: float = setting(10.0, "longer gradients are cut to this; 0: never", 0, INF)
-    precision: str = setting("auto", "of the convolutions; auto: bfloat16 if native", *PRECISIONS)
+    max_grad_norm: float = setting(10.0, "longer gradients are cut to this; 0: never", 0, math.inf)
+    precision: str = setting(PRECISION, "of the convolutions", "bfloat16", "float32")
     device: str = setting("cpu", "cpu; cuda is untested", "cpu", "cuda")
     threads: int = setting(2, "of torch; another number gives other last digits", 1, 256)
-    test_every: int = setting(5_000, "control steps between test points", 1, INF)
+    test_every: int = setting(5_000, "control steps between test points", 1, math.inf)
     test_forests: int = setting(48, "forests a test point", 1, 10_000)
+    checkpoint_every: int = setting(5_000, "control steps between checkpoints", 1, math.inf)
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -106,6 +106,7 @@ MNIH = dict(
 # -------------------------------------------------- pilots: a list of forests -> an action in each
 
 Pilot = Callable[[Sequence[ForestEnv]], Sequence[int]]
+Flights = list[dict]  # of ForestEnv.flight
 
 
 def random_pilot(rng: np.random.Generator) -> Pilot:
@@ -123,9 +124,7 @@ def laser_pilot(envs: Sequence[ForestEnv]) -> Sequence[int]:
     return [dynamic_window(*env.scan(), env.goal_bearing(), env.world) for env in envs]
 
 
-def dynamic_window(
-    bearings: np.ndarray, distances: np.ndarray, goal_bearing: float, world: World
-) -> int:
+def dynamic_window(bearings: ndarray, distances: ndarray, goal_bearing: float, world: World) -> int:
     """Simulate 1.5 s of each yaw rate against the scan's points and take the best.
 
     score = 10 * seconds until the clearance is below 0.8 m + 2 * least clearance (2 m at most)
@@ -148,9 +147,7 @@ def dqn_pilot(q: QNetwork) -> Pilot:
     return lambda envs: greedy(q, np.stack([env.observation for env in envs]))
 
 
-def fly(
-    name: str, pilot: Pilot, seeds: Sequence[int], world: World, camera: bool = True
-) -> list[dict]:
+def fly(who: str, pilot: Pilot, seeds: Sequence[int], world: World, camera: bool = True) -> Flights:
     """Fly one forest a seed, a hundred at once; returns the flights in the order of the seeds."""
     flights, fleet = [], [ForestEnv(world, camera=camera) for _ in seeds[:100]]
     for group in (seeds[i : i + 100] for i in range(0, len(seeds), 100)):
@@ -158,20 +155,20 @@ def fly(
         for env, seed in zip(envs, group, strict=True):
             env.reset(seed=seed)
         while flying := [env for env in envs if not env.outcome]:
-            show(f"{name}: {len(flights) + len(envs) - len(flying):,} of {len(seeds):,} landed")
+            show(f"{who}: {len(flights) + len(envs) - len(flying):,} of {len(seeds):,} landed")
             for env, a in zip(flying, pilot(flying), strict=True):
                 env.step(a)
         flights += [env.flight() for env in envs]
     return flights
 
 
-def fly_random(seeds: Sequence[int], world: World, rng: np.random.Generator) -> list[dict]:
+def fly_random(seeds: Sequence[int], world: World, rng: np.random.Generator) -> Flights:
     """The bar: 2,000 random flights or more, equally many through each forest."""
     repeats = math.ceil(RANDOM_FLIGHTS / len(seeds))
     return fly("random", random_pilot(rng), list(seeds) * repeats, world, camera=False)
 
 
-def measure(flights: Sequence[dict]) -> dict[str, np.ndarray]:
+def measure(flights: Flights) -> dict[str, ndarray]:
     """One number a flight (F,): steps, progress in m, return, and 0 or 1 for how it ended.
 
     Crossed means arrived at the goal or left by the far edge.
@@ -181,22 +178,14 @@ def measure(flights: Sequence[dict]) -> dict[str, np.ndarray]:
     return table | {o: np.array([f["outcome"] == o for f in flights]) for o in OUTCOMES}
 
 
-def mean(flights: Sequence[dict], key: str) -> float:
+def mean(flights: Flights, key: str) -> float:
     """Of the flights, or not a number where none has ended yet."""
     return sum(f[key] for f in flights) / len(flights) if flights else math.nan
 
 
 # -------------------------------------------------- train
 
-END = {
-    "": LIVE,
-    "crash": DEAD,
-    "side": DEAD,
-    "back": DEAD,
-    "far": FAR,
-    "goal": GOAL,
-    "time": TRUNCATED,
-}
+END = {"": dqn.LIVE, "far": dqn.FAR, "goal": dqn.GOAL, "time": dqn.TRUNCATED}  # else DEAD
 COLUMNS = {  # a status line: key -> heading, format; log.csv has all but the clock's speed and eta
     "step": ("step", "9,"), "episodes": ("episodes", "9,"), "epsilon": ("epsilon", "8.2f"),
     "speed": ("steps/s", "8.0f"), "eta": ("min left", "9.1f"),
@@ -208,61 +197,163 @@ COLUMNS = {  # a status line: key -> heading, format; log.csv has all but the cl
 }  # fmt: skip
 
 
-def train(c: Config, folder: Path) -> None:
-    """Algorithm 1 of [Mnih15], over c.lanes forests at once; its line numbers are in dqn.py."""
-    torch.set_num_threads(c.threads)
-    world = World(beacon=c.beacon)
-    flight_rng, batch_rng, bar_rng = np.random.default_rng(c.seed).spawn(3)
-    test_seeds = range(TEST_FIRST, TEST_FIRST + c.test_forests)
-    bar = measure(fly_random(test_seeds, world, bar_rng))["steps"].mean()
-    memory = Replay(c.replay, c.lanes)  # line 1
-    agent = DQN(c, world.actions, c.seed)  # lines 2, 3
-    envs = [ForestEnv(world) for _ in range(c.lanes)]
-    for env in envs:
-        env.reset(seed=int(flight_rng.integers(TRAIN_END)))  # lines 4, 5
-    aim = "test_goal" if c.beacon else "test_crossed"  # what chooses the best weights
-    log, timing, recent, episodes, start = [], [], deque(maxlen=100), 0, time.perf_counter()
-    print(f"to {folder}, the best weights so far always in {folder / 'best.pt'}\n")
-    print("".join(f"{head:>{len(format(0, form))}}" for head, form in COLUMNS.values()))
-    for step in range(c.lanes, c.steps + c.lanes, c.lanes):  # line 6
-        eps = linear_schedule(step, c.epsilon_start, c.epsilon_final, c.epsilon_decay)
-        landed = interact(envs, agent.q, eps, memory, flight_rng)
-        recent.extend(landed)
-        episodes += len(landed)
-        lr = linear_schedule(step, c.lr, c.lr_final, c.steps)
-        for _ in range(times_due(step, c.lanes, c.update_every) if step >= c.warmup else 0):
-            agent.learn(memory, lr, batch_rng)
-        row = {"step": step, "episodes": episodes, "updates": agent.updates, "epsilon": eps}
-        row |= {f"train_{key}": mean(recent, key) for key in ("return", "steps")}
-        seconds = time.perf_counter() - start
+class Training:
+    """All that a training is made of: it flies, learns, tests, saves itself and is taken up again.
+
+    book: step, log and what else is a plain number. flights: of every lane, the seed and the
+    actions of each flight in the replay and of the one in the air. These are all that a checkpoint
+    keeps of the replay, one byte a step: a flight is its seed and its actions.
+    """
+
+    def __init__(self, c: Config, folder: Path) -> None:
+        torch.set_num_threads(c.threads)
+        self.c, self.folder, self.world, self.stopped = c, folder, World(beacon=c.beacon), 0
+        *self.rngs, self.bar_rng = np.random.default_rng(c.seed).spawn(3)  # fly, learn
+        self.tests = range(TEST_FIRST, TEST_FIRST + c.test_forests)
+        self.memory = Replay(c.replay, c.lanes)  # line 1
+        self.agent = DQN(c, self.world.actions, c.seed)  # lines 2, 3
+        self.envs = [ForestEnv(self.world) for _ in range(c.lanes)]
+        self.flights: list[list] = [[] for _ in self.envs]
+        self.plans: list[Iterator[int]] = [iter(()) for _ in self.envs]  # seeds flown before
+        self.book: dict = {"step": 0, "episodes": 0, "seconds": 0.0, "log": [], "timing": []}
+        self.book["recent"] = []  # flights, at most 100
+
+    def stop(self, number: int, _frame: object) -> None:
+        """A first Ctrl-C or SIGTERM lets the step end and saves; a second stops at once."""
+        if self.stopped:
+            raise KeyboardInterrupt
+        self.stopped = number
+
+    def begin(self) -> None:
+        """Measure the random pilot on the test forests, and take off in every lane."""
+        bar = measure(fly_random(self.tests, self.world, self.bar_rng))
+        self.book["bar"] = float(bar["steps"].mean())
+        for lane in range(self.c.lanes):
+            self.take_off(lane)
+        self.save()
+
+    def take_off(self, lane: int) -> None:
+        """Begin an episode (lines 4, 5) and its record, which grows as the drone flies."""
+        seed = next(self.plans[lane], int(self.rngs[0].integers(TRAIN_END)))
+        self.envs[lane].reset(seed=seed)
+        self.flights[lane].append((seed, self.envs[lane].actions))
+
+    def step(self) -> dict[str, float]:
+        """One control step in every lane (line 6) and the updates then due; returns a log row."""
+        c, book = self.c, self.book
+        book["step"] += c.lanes
+        eps = linear_schedule(book["step"], c.epsilon_start, c.epsilon_final, c.epsilon_decay)
+        lr = linear_schedule(book["step"], c.lr, c.lr_final, c.steps)
+        landed = self.advance(self.choose(eps))
+        book["episodes"] += len(landed)
+        book["recent"] = (book["recent"] + landed)[-100:]
+        due = times_due(book["step"], c.lanes, c.update_every) if book["step"] >= c.warmup else 0
+        for _ in range(due):
+            self.expect_finite(self.agent.learn(self.memory, lr, self.rngs[1]))
+        row = {"step": book["step"], "episodes": book["episodes"], "updates": self.agent.updates}
+        means = {f"train_{key}": mean(book["recent"], key) for key in ("return", "steps")}
+        return row | {"epsilon": eps} | means
+
+    def choose(self, eps: float) -> ndarray:
+        """An action for every lane (L,), epsilon-greedily."""
+        s = np.stack([env.observation for env in self.envs])  # (L, 4, 84, 84)
+        explore = self.rngs[0].random(len(s)) < eps  # (L,) line 7
+        anything = self.rngs[0].integers(self.world.actions, size=len(s))  # (L,)
+        return np.where(explore, anything, greedy(self.agent.q, s))  # (L,) line 8
+
+    def advance(self, a: ndarray) -> Flights:
+        """Fly actions a (L,) and remember what came of them; returns the flights that ended."""
+        s = np.stack([env.observation for env in self.envs])  # (L, 4, 84, 84)
+        steps = [env.step(action) for env, action in zip(self.envs, a.tolist(), strict=True)]
+        s2, r, *_ = zip(*steps, strict=True)  # lines 9, 10
+        end = [END.get(env.edge or env.outcome, dqn.DEAD) for env in self.envs]
+        self.memory.add(s, a, r, s2, end)  # line 11
+        landed = {lane: env.flight() for lane, env in enumerate(self.envs) if env.outcome}
+        for lane in landed:
+            self.take_off(lane)
+        return list(landed.values())
+
+    def test(self, row: dict[str, float]) -> dict[str, float]:
+        """Fly the test forests greedily, log it, and keep the best weights; returns the log row."""
+        book, log, q = self.book, self.book["log"], self.agent.q
+        flights = measure(fly("dqn", dqn_pilot(q), self.tests, self.world))
+        row |= {f"test_{key}": float(values.mean()) for key, values in flights.items()}
+        log.append(row | {"test_over_random": row["test_steps"] / book["bar"] - 1})
+        book["timing"].append({"step": book["step"], "seconds": round(book["seconds"], 1)})
+        for name in ("log", "timing"):
+            write_csv(self.folder / f"{name}.csv", book[name])
+        aim = "test_goal" if self.c.beacon else "test_crossed"
+        if max(log, key=lambda past: (past[aim], past["test_progress"])) is log[-1]:
+            save_weights(self.folder / "best.pt", q, self.c.beacon)
+        return log[-1]
+
+    def expect_finite(self, x: float) -> None:
+        """Stop before anything that is not a number reaches a file."""
+        if not math.isfinite(x):
+            why = f"step {self.book['step']:,}: learning rate too high or optimizer_eps too low?"
+            last = f"The last good checkpoint is {self.folder / CHECKPOINT}"
+            raise FloatingPointError(f"loss or weights are {x} at {why} {last}")
+
+    def save(self) -> None:
+        """Write the checkpoint: 27 MB, and one byte for each step in the replay."""
+        self.expect_finite(sum(p.sum().item() for p in self.agent.q.state_dict().values()))
+        for lane in self.flights:  # forget the flights whose last frame is overwritten
+            while sum(len(actions) for _, actions in lane[1:]) >= self.memory.rows:
+                lane.pop(0)
+        flights = [[(seed, "".join(map(str, a))) for seed, a in lane] for lane in self.flights]
+        content = {"config": asdict(self.c), "torch": TORCH, "book": self.book, "flights": flights}
+        content |= {"rngs": [rng.bit_generator.state for rng in self.rngs]}
+        content |= {"agent": self.agent.state_dict(), "updates": self.agent.updates}
+        content |= {"optimizer": self.agent.optimizer.state_dict(), "added": self.memory.added}
+        save(self.folder / CHECKPOINT, "checkpoint", content)
+
+    def restore(self, saved: dict) -> None:
+        """Take up a saved training: fly its replay again, then set everything else as it was."""
+        rows = min(saved["added"], self.memory.rows)
+        self.memory.added = saved["added"] - rows
+        self.plans = [iter([seed for seed, _ in lane]) for lane in saved["flights"]]
+        digits = ["".join(actions for _, actions in lane) for lane in saved["flights"]]
+        for lane, env in enumerate(self.envs):
+            self.take_off(lane)
+            for a in digits[lane][:-rows]:  # frames that were overwritten already
+                env.step(int(a))
+        for row in range(-rows, 0):
+            show(f"flying the replay again: {row * -len(digits):,} steps to go")
+            self.advance(np.array([int(actions[row]) for actions in digits]))
+        self.book, self.agent.updates = saved["book"], saved["updates"]
+        self.agent.load_state_dict(saved["agent"])
+        self.agent.optimizer.load_state_dict(saved["optimizer"])
+        for rng, state in zip(self.rngs, saved["rngs"], strict=True):
+            rng.bit_generator.state = state
+
+
+def train(run: Training, saved: dict | None) -> int:
+    """Algorithm 1 of [Mnih15], over c.lanes forests at once; its line numbers are in dqn.py.
+
+    Goes on from a checkpoint if there is one; returns the exit code.
+    """
+    c = run.c
+    print(f"to {run.folder}; its best.pt always holds the best weights so far", flush=True)
+    run.restore(saved) if saved else run.begin()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, run.stop)
+    print("\n" + "".join(f"{head:>{len(format(0, form))}}" for head, form in COLUMNS.values()))
+    start = time.perf_counter() - run.book["seconds"]
+    while run.book["step"] < c.steps and not run.stopped:
+        row = run.step()
+        step, seconds = row["step"], time.perf_counter() - start
+        run.book["seconds"] = seconds
         speed = {"speed": step / seconds, "eta": max(c.steps - step, 0) * seconds / step / 60}
         show(status(row | speed))
         if times_due(step, c.lanes, c.test_every) or step >= c.steps:
-            log.append(row | greedy_test(agent.q, test_seeds, world, bar))
-            timing.append({"step": step, "seconds": round(time.perf_counter() - start, 1)})
-            print(status(log[-1] | speed), flush=True)
-            write_csv(folder / "log.csv", log)
-            write_csv(folder / "timing.csv", timing)
-            if max(log, key=lambda past: (past[aim], past["test_progress"])) is log[-1]:
-                save_weights(folder / "best.pt", agent.q, c.beacon)
-
-
-def interact(
-    envs: Sequence[ForestEnv], q: QNetwork, eps: float, memory: Replay, rng: np.random.Generator
-) -> list[dict]:
-    """One control step in each of L forests, epsilon-greedily; returns the flights that ended."""
-    lanes, actions = len(envs), envs[0].world.actions
-    s = np.stack([env.observation for env in envs])  # (L, 4, 84, 84)
-    explore = rng.random(lanes) < eps  # (L,) line 7
-    a = np.where(explore, rng.integers(actions, size=lanes), greedy(q, s))  # (L,) line 8
-    steps = [env.step(action) for env, action in zip(envs, a.tolist(), strict=True)]  # lines 9, 10
-    s2, r = [step[0] for step in steps], [step[1] for step in steps]
-    memory.add(s, a, r, s2, [END[env.edge or env.outcome] for env in envs])  # line 11
-    over = [env for env in envs if env.outcome]
-    flights = [env.flight() for env in over]
-    for env in over:
-        env.reset(seed=int(rng.integers(TRAIN_END)))  # lines 4, 5
-    return flights
+            print(status(run.test(row) | speed), flush=True)
+        if times_due(step, c.lanes, c.checkpoint_every) or step >= c.steps or run.stopped:
+            run.save()
+    if not run.stopped:
+        return 0
+    again = [sys.orig_argv[0], sys.argv[0], "train", "--resume", str(run.folder)]
+    print(f"\nsaved at step {run.book['step']:,}; to go on:\n{shlex.join(again)}")
+    return 128 + run.stopped
 
 
 def times_due(step: int, stride: int, every: int) -> int:
@@ -279,13 +370,6 @@ def status(row: dict) -> str:
     return "".join(format(row[key], form) for key, (_, form) in COLUMNS.items() if key in row)
 
 
-def greedy_test(q: QNetwork, seeds: Sequence[int], world: World, bar: float) -> dict[str, float]:
-    """Means over the greedy policy's flights through the test forests."""
-    flights = measure(fly("dqn", dqn_pilot(q), seeds, world))
-    row = {f"test_{key}": float(values.mean()) for key, values in flights.items()}
-    return row | {"test_over_random": row["test_steps"] / bar - 1}
-
-
 def show(text: str) -> None:
     """Show a passing status on a terminal; nothing when piped."""
     if sys.stdout.isatty():
@@ -293,33 +377,27 @@ def show(text: str) -> None:
 
 
 def write_csv(path: Path, rows: Sequence[dict]) -> None:
-    """One line a row under a line of names."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    """One line of numbers a row, under a line of names."""
+    lines = [",".join(map(str, line)) for line in (rows[0], *(row.values() for row in rows))]
+    write_whole(path, "\n".join([*lines, ""]).encode())
 
 
 def save_weights(path: Path, q: QNetwork, beacon: bool) -> None:
     """Half precision, 3.4 MB, and the world they were trained in."""
     half = {name: value.half().cpu() for name, value in q.state_dict().items()}
-    torch.save({"beacon": beacon, "network": half}, path)
+    save(path, "weights", {"beacon": beacon, "network": half})
 
 
 def load_weights(path: Path, beacon: bool) -> QNetwork:
-    """Read what save_weights wrote; never runs code from the file. Raises ValueError."""
-    try:
-        with warnings.catch_warnings(action="ignore"):  # torch has views on foreign pickles
-            saved = torch.load(path, weights_only=True)
-        trained_with = saved["beacon"]
-        q = QNetwork(World.actions)
-        q.load_state_dict(saved["network"])
-    except FileNotFoundError:
-        raise ValueError(f"weights {path} do not exist") from None
-    except (OSError, EOFError, RuntimeError, LookupError, TypeError, pickle.UnpicklingError):
-        raise ValueError(f"{path} is not a weights file of Deep Flight") from None
-    if trained_with != beacon:
-        raise ValueError(f"{path} was trained {'with' if trained_with else 'without'} the beacon")
+    """Read what save_weights wrote. Raises ValueError."""
+    saved, q = load(path, "weights"), QNetwork(World.actions)
+    for name, needed in q.state_dict().items():
+        shape = tuple(saved["network"].get(name, torch.empty(0)).shape)
+        if shape != needed.shape:
+            raise ValueError(f"{path}: {name} is {shape}, the network needs {tuple(needed.shape)}")
+    if saved["beacon"] != beacon:
+        raise ValueError(f"{path} was trained with{'' if saved['beacon'] else 'out'} the beacon")
+    q.load_state_dict(saved["network"])
     return q
 
 
@@ -334,7 +412,7 @@ ROWS = {  # the table: figure -> label, factor, digits
 }  # fmt: skip
 
 
-def evaluate(args: argparse.Namespace) -> None:
+def evaluate(args: argparse.Namespace) -> int:
     """Fly every pilot through the same forests; print the table, write pictures and JSON."""
     torch.set_num_threads(Config.threads)
     world, rng = World(beacon=args.beacon), np.random.default_rng(0)
@@ -349,12 +427,12 @@ def evaluate(args: argparse.Namespace) -> None:
     if args.json:
         head = {"weights": str(args.weights), "beacon": args.beacon, "first_seed": seeds[0]}
         report = {p: figures[p] | {"flights": flights[p]} for p in flights}
-        args.json.write_text(json.dumps(head | {"forests": len(seeds), "pilots": report}) + "\n")
+        text = json.dumps(head | {"forests": len(seeds), "pilots": report}) + "\n"
+        write_whole(args.json, text.encode())
+    return 0
 
 
-def summarize(
-    flights: Sequence[dict], bar: Sequence[dict], forests: int, rng: np.random.Generator
-) -> dict[str, dict[str, float]]:
+def summarize(flights: Flights, bar: Flights, forests: int, rng: np.random.Generator) -> dict:
     """Every figure with its 95 % interval: value, low, high.
 
     Means are bootstrapped over forests, for flights through one forest are no independent draws;
@@ -364,21 +442,20 @@ def summarize(
     draws = rng.integers(forests, size=(2000, forests))  # resampled forests
     means = {key: per_forest(table[key], forests) for key in ("steps", "progress", "return")}
     figures = {key: interval(x.mean(), x[draws].mean(1)) for key, x in means.items()}
-    steps = means["steps"]
-    ratios = steps[draws].mean(1) / random_steps[draws].mean(1)
-    figures["over_random"] = interval(steps.mean() / random_steps.mean() - 1, ratios - 1)
+    ratios = means["steps"][draws].mean(1) / random_steps[draws].mean(1)
+    figures["over_random"] = interval(means["steps"].mean() / random_steps.mean() - 1, ratios - 1)
     figures["seconds"] = {k: v * World.dt for k, v in figures["steps"].items()}
     for key in ("crossed", *OUTCOMES):
         figures[key] = wilson(int(table[key].sum()), len(flights))
     return figures
 
 
-def per_forest(values: np.ndarray, forests: int) -> np.ndarray:
+def per_forest(values: ndarray, forests: int) -> ndarray:
     """Mean of the flights through each forest (F,), which repeat in the same order."""
     return values.reshape(-1, forests).mean(0)
 
 
-def interval(value: float, resampled: np.ndarray) -> dict[str, float]:
+def interval(value: float, resampled: ndarray) -> dict[str, float]:
     """A figure and the middle 95 % of its bootstrap."""
     low, high = np.percentile(resampled, [2.5, 97.5])
     return {"value": float(value), "low": float(low), "high": float(high)}
@@ -400,32 +477,27 @@ def print_table(figures: dict[str, dict]) -> None:
     """One row a figure, one column a pilot, 95 % intervals in brackets."""
     print(f"{'':20}" + "".join(f"{name:>26}" for name in figures))
     for key, (label, factor, digits) in ROWS.items():
-        cells = ""
-        for pilot in figures.values():
-            value, low, high = (f"{factor * x:.{digits}f}" for x in pilot[key].values())
-            cells += f"{f'{value} [{low}, {high}]':>26}"
-        print(f"{label:20}{cells}")
+        cells = [[f"{factor * x:.{digits}f}" for x in p[key].values()] for p in figures.values()]
+        print(f"{label:20}" + "".join(f"{f'{x} [{low}, {high}]':>26}" for x, low, high in cells))
 
 
-def draw_pictures(
-    flights: dict[str, Sequence[dict]], seeds: Sequence[int], world: World, out: Path
-) -> None:
-    """Draw every pilot in the first four forests, and film the last pilot in the first."""
+def draw_pictures(flights: dict[str, Flights], seeds: range, world: World, out: Path) -> None:
+    """Draw every pilot in the first three forests, and film the last pilot in the first."""
     size, maps = (world.length, world.width), []
-    for i, seed in enumerate(seeds[:4]):
+    for i, seed in enumerate(seeds[:3]):
         tracks = [(*track(f[i], world), name) for name, f in flights.items()]
         maps.append(render.draw_map(plant(seed, world), size, tracks, f"forest {seed}"))
-    render.draw_sheet(maps).save(out / "flights.png")
+    render.Image.fromarray(np.vstack(maps)).save(out / "flights.png")
     shown = list(flights.values())[-1][0]
     trunks, title, (path, ended) = plant(seeds[0], world), f"forest {seeds[0]}", track(shown, world)
     growing = [(path[:t], "", "") for t in range(1, len(path))] + [(path, ended, "")]
     maps = [render.draw_map(trunks, size, [part], title) for part in growing]
     frames = [step[0][-1] for step in refly(shown["seed"], shown["actions"], world)]
-    render.save_gif(out / "flight.gif", render.film(frames, maps), round(1000 * world.dt))
+    render.save_film(out / "flight.gif", frames, maps, round(1000 * world.dt))
     print(f"\nwrote {out / 'flights.png'} and {out / 'flight.gif'}")
 
 
-def track(flight: dict, world: World) -> tuple[np.ndarray, str]:
+def track(flight: dict, world: World) -> tuple[ndarray, str]:
     """Where a flight went (T + 1, 2) in m, by flying it again, and its edge or outcome."""
     steps = refly(flight["seed"], flight["actions"], world, camera=False)
     path = np.array([info["pose"][:2] for *_, info in steps])
@@ -449,7 +521,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     commands = parser.add_subparsers(dest="command", required=True)
     sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
     sub.add_argument("--preset", choices=("default", "mnih"), default="default")
-    sub.add_argument("--name", default="", help="of the folder in runs/; without it a fresh number")
+    which = sub.add_mutually_exclusive_group()
+    which.add_argument("--name", default="", help="of the folder in runs/; else a fresh number")
+    which.add_argument("--resume", type=Path, default=None, help="the folder to go on in")
     for f in fields(Config):
         kind = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type}
         text = f"{f.metadata['help']} (default: {f.default})"
@@ -466,55 +540,82 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def prepare_train(args: argparse.Namespace) -> Callable[[], None]:
-    """Check everything and make the run's folder, before anything flies."""
+def prepare_train(args: argparse.Namespace) -> Callable[[], int]:
+    """Check everything and make or reopen the run's folder, before anything flies."""
     given = {f.name: getattr(args, f.name) for f in fields(Config) if hasattr(args, f.name)}
-    c = Config(**((MNIH if args.preset == "mnih" else {}) | given))
-    if c.precision == "auto":
-        c = replace(c, precision="bfloat16" if BFLOAT16 else "float32")
+    given = (MNIH if args.preset == "mnih" else {}) | given
+    if args.resume:
+        saved = load(args.resume / CHECKPOINT, "checkpoint")
+        run = Training(agreed(saved, given | {"torch": TORCH}, args.resume), args.resume)
+        run.lock = lock_folder(run.folder)
+        return lambda: train(run, saved)
+    c = Config(**given)
     if c.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device is 'cuda', but torch finds none here: use cpu")
-    if args.name != Path(args.name).name or args.name.startswith("."):
-        raise ValueError(f"name is {args.name!r}, allowed is the name of one folder in runs/")
     numbers = (Path(f"runs/{i:03d}") for i in itertools.count(1))
     folder = Path("runs") / args.name if args.name else next(p for p in numbers if not p.exists())
-    if folder.exists():
-        raise ValueError(f"{folder} exists and is never overwritten: choose another name")
+    if folder.parent != Path("runs") or folder.name == ".." or folder.exists():
+        raise ValueError(f"name is {args.name!r}, allowed is that of a new folder in runs/")
+    run = Training(c, folder)  # before the folder is made, for memory may not suffice
     folder.mkdir(parents=True)
-    settings = {"preset": args.preset, "torch": torch.__version__} | asdict(c)
-    (folder / "config.json").write_text(json.dumps(settings, indent=2) + "\n")
-    return lambda: train(c, folder)
+    text = json.dumps({"preset": args.preset, "torch": TORCH} | asdict(c), indent=2) + "\n"
+    write_whole(folder / "config.json", text.encode())
+    run.lock = lock_folder(folder)
+    return lambda: train(run, None)
 
 
-def prepare_eval(args: argparse.Namespace) -> Callable[[], None]:
+def agreed(saved: dict, given: dict[str, Any], folder: Path) -> Config:
+    """The settings of a checkpoint, if nothing that is given now contradicts them."""
+    there = saved["config"] | {"torch": saved["torch"]}
+    differ = [f"{key} is {x}, was {there[key]}" for key, x in given.items() if x != there[key]]
+    if differ:
+        differ = ", ".join(differ)
+        raise ValueError(f"{folder} has other settings: {differ}; leave them out or begin anew")
+    if saved["book"]["step"] >= there["steps"]:
+        raise ValueError(f"{folder} has flown all of its {there['steps']:,} steps")
+    return Config(**saved["config"])
+
+
+def lock_folder(folder: Path) -> sqlite3.Connection:
+    """Keep a second training out until this one ends, however it ends.
+
+    SQLite's lock is the one in the standard library that works everywhere and dies with its owner.
+    """
+    lock = sqlite3.connect(folder / "lock", timeout=0, isolation_level=None)
+    try:
+        lock.execute("BEGIN EXCLUSIVE")
+    except sqlite3.OperationalError as error:
+        raise ValueError(f"{folder} is another training's, or cannot be held: {error}") from None
+    return lock
+
+
+def prepare_eval(args: argparse.Namespace) -> Callable[[], int]:
     """Check everything and read the weights, before anything flies."""
     if args.episodes < 1 or args.first_seed < 0:
-        given = f"episodes is {args.episodes} and first-seed {args.first_seed}"
+        given = f"episodes is {args.episodes}, first-seed {args.first_seed}"
         raise ValueError(f"{given}, allowed: from 1 and from 0")
     if args.json and (args.json.is_dir() or not args.json.absolute().parent.is_dir()):
         raise ValueError(f"{args.json} cannot be written: it needs an existing folder")
-    if not args.weights:
-        name = "beacon.pt" if args.beacon else "paper.pt"
-        args.weights = Path(__file__).parent / "weights" / name
+    shipped = Path(__file__).parent / "weights" / ("beacon.pt" if args.beacon else "paper.pt")
+    args.weights = args.weights or shipped
     args.q = load_weights(args.weights, args.beacon) if "dqn" in args.pilots else None
     args.out.mkdir(parents=True, exist_ok=True)
     return lambda: evaluate(args)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; bad input is one line and exit code 2."""
-    args = parse(argv)
+    """Run one command; what goes wrong is one line: bad input exit code 2, trouble on the way 1."""
+    args, code, trouble = parse(argv), 2, (ValueError, OSError, MemoryError)
     try:
         job = (prepare_train if args.command == "train" else prepare_eval)(args)
-    except (ValueError, OSError) as error:
+        code, trouble = 1, (FloatingPointError, OSError)
+        return job()
+    except trouble as error:
         print(f"deepflight.py {args.command}: error: {error}", file=sys.stderr)
-        return 2
-    try:
-        job()
+        return code
     except KeyboardInterrupt:
         print("\ninterrupted", file=sys.stderr)
         return 130
-    return 0
 
 
 if __name__ == "__main__":

@@ -30,6 +30,11 @@ rewards in r; end how these ended; y the target; B batch, T rows and L lanes of 
 Not in this file: prioritized replay, distributional values, noisy layers.
 """
 
+import hashlib
+import io
+import os
+from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -187,10 +192,11 @@ def linear_schedule(step: int, first: float, final: float, steps: int) -> float:
     return final + (first - final) * max(1 - step / steps, 0)
 
 
-class DQN:
+class DQN(nn.Module):
     """Q, Q^ and the optimiser. settings: the learner's fields of deepflight.Config."""
 
     def __init__(self, settings: Any, actions: int, seed: int) -> None:
+        super().__init__()
         self.settings, self.actions, self.updates = settings, actions, 0
         with torch.random.fork_rng():  # torch draws initial weights from its global generator:
             torch.manual_seed(seed % 2**64)  # lend it our seed and put its own state back
@@ -200,8 +206,8 @@ class DQN:
         self.optimizer = make_optimizer(self.q, settings)
         self.worth = {DEAD: 0.0, GOAL: settings.goal_value, FAR: settings.far_value}
 
-    def learn(self, memory: Replay, lr: float, rng: np.random.Generator) -> None:
-        """One gradient step on a batch from memory (lines 12 to 15)."""
+    def learn(self, memory: Replay, lr: float, rng: np.random.Generator) -> float:
+        """One gradient step on a batch from memory (lines 12 to 15); returns its loss."""
         c = self.settings
         batch = memory.sample(c.batch, c.n, c.gamma, rng)  # line 12
         if c.mirror:
@@ -223,12 +229,56 @@ class DQN:
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.q_target.load_state_dict(self.q.state_dict())  # line 15
+        return loss.item()
 
 
 def make_optimizer(q: QNetwork, c: Any) -> torch.optim.Optimizer:
     """Adam, or [Mnih15]'s RMSProp."""
+    theta, eps = q.parameters(), c.optimizer_eps
     if c.optimizer == "adam":
-        return torch.optim.Adam(q.parameters(), c.lr, eps=c.optimizer_eps, fused=True)
-    return torch.optim.RMSprop(
-        q.parameters(), c.lr, alpha=0.95, eps=c.optimizer_eps, momentum=0.95, centered=True
-    )
+        return torch.optim.Adam(theta, c.lr, eps=eps, fused=True)
+    return torch.optim.RMSprop(theta, c.lr, alpha=0.95, eps=eps, momentum=0.95, centered=True)
+
+
+# -------------------------------------------------- files that are whole, or not there
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file so that the old one or the new one is there, whole, whenever the power fails."""
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        if part.read_bytes() != data:
+            raise OSError(f"{part} does not read as it was written")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def save(path: Path, kind: str, content: dict) -> None:
+    """Write tensors and plain values with torch.save, and behind them their SHA-256."""
+    buffer = io.BytesIO()
+    torch.save({"kind": kind} | content, buffer)
+    write_whole(path, buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
+
+
+def load(path: Path, kind: str) -> dict:
+    """Read what save wrote, or raise ValueError; no code from the file is ever run.
+
+    The digest comes first, for torch.load takes flipped bits for numbers; PK begins every archive
+    of torch.save.
+    """
+    try:
+        data = path.read_bytes()
+        if data[:2] != b"PK" or hashlib.sha256(data[:-32]).digest() != data[-32:]:
+            raise ValueError(f"{path} is damaged, or no file of Deep Flight: its digest is wrong")
+        content = torch.load(io.BytesIO(data[:-32]), weights_only=True)
+        if content["kind"] != kind:
+            raise ValueError(f"{path} holds {content['kind']}, needed: {kind}")
+        return content
+    except (OSError, EOFError, LookupError, RuntimeError, TypeError, UnpicklingError) as error:
+        why = str(error).partition("\n")[0]
+        raise ValueError(f"{path} cannot be read: {why}") from None

@@ -25,13 +25,16 @@ Not in this file: textures, shadows, trunks that lean, a drone that climbs.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+from numpy import ndarray
 from PIL import Image, ImageDraw
+
+Point = tuple[float, float]  # x, y
 
 PIXELS = 84  # height and width of a frame [DF §II-A]
 CENTRE = (PIXELS - 1) / 2  # the optical axis meets the picture between the two middle pixels
@@ -58,9 +61,7 @@ class Scene:
     beacon_grey: int = 140  # clear, but no more: a white pole is shunned like bark
 
 
-def raycast(
-    trunks: np.ndarray, radius: float, bearings: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def raycast(trunks: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray, ndarray]:
     """Find what each ray from the origin hits first.
 
     trunks (N, 2): centres relative to the eye, m. bearings (M,): rad, in the same axes.
@@ -84,19 +85,19 @@ def raycast(
     return hit, np.where(hit < np.inf, half_chord[nearest, rays] / radius, 0.0)
 
 
-def fade(grey: np.ndarray, distance: np.ndarray, scene: Scene) -> np.ndarray:
+def fade(grey: ndarray, distance: ndarray, scene: Scene) -> ndarray:
     """Mix a grey level with the sky's, the more the farther: at the end of the view all is haze."""
     return scene.sky + (grey - scene.sky) * np.maximum(1 - distance / scene.view, 0)
 
 
 @cache
-def backdrop(scene: Scene) -> np.ndarray:
+def backdrop(scene: Scene) -> ndarray:
     """Sky above the horizon, ground that brightens towards it, as one column (84, 1) uint8."""
     depth = np.where(SLOPES < 0, scene.altitude / np.abs(SLOPES), np.inf)  # (84,) m
     return fade(np.float64(scene.ground), depth, scene).astype(np.uint8)[:, None]
 
 
-def silhouette(distance: np.ndarray, height: float, scene: Scene) -> np.ndarray:
+def silhouette(distance: ndarray, height: float, scene: Scene) -> ndarray:
     """Pixels (84, 84) bool covered by walls of this height that stand at distance (84,) m."""
     depth = distance * np.cos(BEARINGS)  # (84,) m along the optical axis
     rows = SLOPES[:, None]  # (84, 1)
@@ -104,12 +105,8 @@ def silhouette(distance: np.ndarray, height: float, scene: Scene) -> np.ndarray:
 
 
 def camera(
-    eye: tuple[float, float],
-    heading: float,
-    trunks: np.ndarray,
-    scene: Scene,
-    beacon: tuple[float, float] | None = None,
-) -> np.ndarray:
+    eye: Point, heading: float, trunks: ndarray, scene: Scene, beacon: Point | None = None
+) -> ndarray:
     """Draw what the drone sees: a frame (84, 84) uint8.
 
     eye: x, y in m. heading: rad, counter-clockwise from x. trunks (N, 2): centres in m.
@@ -143,10 +140,7 @@ COLOURS = {"crash": "#d62728", "goal": "#2ca02c", "far": "#17a2b8", "": "#1f77b4
 
 
 def draw_map(
-    trunks: np.ndarray,
-    size: tuple[float, float],
-    flights: Iterable[tuple[np.ndarray, str, str]],
-    title: str = "",
+    trunks: ndarray, size: Point, flights: Iterable[tuple[ndarray, str, str]], title: str = ""
 ) -> Image.Image:
     """Draw a forest from above, x to the right and y up.
 
@@ -155,7 +149,7 @@ def draw_map(
     """
     length, width = size
 
-    def pixel(x: float, y: float) -> tuple[float, float]:
+    def pixel(x: float, y: float) -> Point:
         return (x + MARGIN) * SCALE, (width / 2 + MARGIN - y) * SCALE
 
     def disc(x: float, y: float, r: float, colour: str) -> None:
@@ -178,17 +172,11 @@ def draw_map(
     return image
 
 
-def draw_sheet(maps: Sequence[Image.Image]) -> Image.Image:
-    """Put equal pictures below one another, two in a row."""
-    width, height = maps[0].size
-    sheet = Image.new("RGB", (2 * width, (len(maps) + 1) // 2 * height), "white")
-    for i, image in enumerate(maps):
-        sheet.paste(image, (i % 2 * width, i // 2 * height))
-    return sheet
+def save_film(file: Path, frames: Iterable, maps: Iterable, milliseconds: int) -> None:
+    """Write an endless GIF: the camera's frames (T of (84, 84)) beside T maps at half their size.
 
-
-def film(frames: Iterable[np.ndarray], maps: Iterable[Image.Image]) -> list[Image.Image]:
-    """Put the camera's frames (T of (84, 84)) beside T maps, at half the maps' size."""
+    Its last picture stays for two seconds.
+    """
     pictures = []
     for frame, chart in zip(frames, maps, strict=True):
         width, height = chart.width // 2, chart.height // 2
@@ -196,10 +184,5 @@ def film(frames: Iterable[np.ndarray], maps: Iterable[Image.Image]) -> list[Imag
         both.paste(Image.fromarray(frame).resize((height, height), Image.Resampling.NEAREST))
         both.paste(chart.resize((width, height), Image.Resampling.BILINEAR), (height, 0))
         pictures.append(both.quantize(256, dither=Image.Dither.NONE))
-    return pictures
-
-
-def save_gif(file: Path, pictures: Sequence[Image.Image], milliseconds: int) -> None:
-    """Write an endless animation; its last picture stays for two seconds."""
     times = [milliseconds] * (len(pictures) - 1) + [2000]
     pictures[0].save(file, save_all=True, append_images=pictures[1:], duration=times, loop=0)

@@ -124,47 +124,86 @@ def test_training_test_and_evaluation_forests_are_three_disjoint_ranges() -> Non
     assert tests[-1] < deepflight.EVAL_FIRST
 
 
-BAD = [
-    "train --preset ppo",
-    "train --batch 0",
-    "train --batch many",
-    "train --gamma 1.5",
-    "train --gamma nan",
-    "train --epsilon-final -0.1",
-    "train --optimizer sgd",
-    "train --replay 10",
-    "train --warmup 20 --lanes 8",
-    "train --name a/b",
-    "train --name ..",
-    "train --colour red",
-    "train --seed -1",
-    "eval --pilots laser pigeon",
-    "eval --episodes 0",
-    "eval --episodes -5",
-    "eval --first-seed -1",
-    "eval --weights nowhere.pt",
-    "eval --weights foreign.pt",
-    "eval --weights pickle.pt",
-    "eval --weights text.pt",
-    "eval --weights .",
-    "eval --json nowhere/x.json",
-    "eval --out text.pt",
-    "eval --beacon --weights paper.pt",
-    "fly",
-    "",
-]
+BAD = """\
+train --preset ppo
+train --preset
+train --batch 0
+train --batch many
+train --batch 2.5
+train --gamma 1.5
+train --gamma nan
+train --epsilon-final -0.1
+train --epsilon-start inf
+train --optimizer sgd
+train --replay 10
+train --replay 1e6
+train --replay 100000000000000
+train --warmup 20 --lanes 8
+train --lanes 0
+train --lanes 1001
+train --n 0
+train --n 100 --warmup 800
+train --lr -1
+train --lr nan
+train --goal-value inf
+train --far-value nan
+train --max-grad-norm -1
+train --precision float16
+train --device tpu
+train --threads 0
+train --steps 0
+train --steps -5
+train --test-every 0
+train --test-forests 0
+train --checkpoint-every 0
+train --update-every 0
+train --name a/b
+train --name ..
+train --name .
+train --name runs/a
+train --name taken
+train --seed -1
+train --seed 1.5
+train --colour red
+train now
+train --resume nowhere
+train --resume runs/taken --name other
+train --resume runs/taken
+train --resume paper.pt
+eval --pilots laser pigeon
+eval --pilots
+eval --episodes 0
+eval --episodes -5
+eval --episodes few
+eval --first-seed -1
+eval --weights nowhere.pt
+eval --weights foreign.pt
+eval --weights pickle.pt
+eval --weights text.pt
+eval --weights small.pt
+eval --weights .
+eval --json nowhere/x.json
+eval --json .
+eval --out text.pt
+eval --beacon --weights paper.pt
+fly
+"""
 
 
 def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
+    lines = [*BAD.splitlines(), ""]
+    assert len(lines) > 50
     torch.save({"weights": torch.zeros(3)}, tmp_path / "foreign.pt")
     (tmp_path / "pickle.pt").write_bytes(pickle.dumps(subprocess.Popen))
     (tmp_path / "text.pt").write_text("no weights")
+    (tmp_path / "runs/taken").mkdir(parents=True)
     deepflight.save_weights(tmp_path / "paper.pt", QNetwork(9), beacon=False)
+    deepflight.save_weights(tmp_path / "small.pt", QNetwork(5), beacon=False)
     before = sorted(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
-    for line in BAD:
+    for line in lines:
         try:
             code = deepflight.main(line.split())
         except SystemExit as stop:  # argparse's way
@@ -174,7 +213,7 @@ def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
         assert error.count("\n") == 1, line
         assert "error: " in error, line
         assert not out, line
-    assert sorted(tmp_path.rglob("*")) == before
+        assert sorted(tmp_path.rglob("*")) == before, line
 
 
 # -------------------------------------------------- train
@@ -186,7 +225,8 @@ def test_twenty_seconds_of_training_through_the_real_command_line(tmp_path: Path
     done = command("train", *SHORT, "--name", "first", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     run = tmp_path / "runs" / "first"
-    assert {p.name for p in run.iterdir()} == {"best.pt", "config.json", "log.csv", "timing.csv"}
+    files = {"best.pt", "checkpoint.pt", "config.json", "lock", "log.csv", "timing.csv"}
+    assert {p.name for p in run.iterdir()} == files
     assert json.loads((run / "config.json").read_text())["steps"] == 1200
     with (run / "log.csv").open() as file:
         rows = list(csv.DictReader(file))

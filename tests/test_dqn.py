@@ -1,5 +1,10 @@
 """What the brain learns from, against a naive replay, hand arithmetic and a tiny solved MDP."""
 
+import hashlib
+import io
+import pickle
+import resource
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,8 +23,11 @@ from dqn import (
     Replay,
     greedy,
     linear_schedule,
+    load,
     mirror,
+    save,
     td_target,
+    write_whole,
 )
 
 SETTINGS = SimpleNamespace(
@@ -247,3 +255,98 @@ def test_the_agent_solves_a_tiny_mdp(n: int) -> None:
     if n == 1:  # longer windows of a random walk are off-policy, so their values are lower
         best = agent.q(torch.from_numpy(states)).max(1).values.detach().numpy()
         assert best == pytest.approx([0.9**3, 0.9**2, 0.9, 1.0], abs=0.1)
+
+
+# -------------------------------------------------- files that are whole, or not there
+
+
+class Payload:
+    """A pickle that makes a file when it is loaded, as a malicious one would."""
+
+    def __init__(self, trap: Path) -> None:
+        self.trap = trap
+
+    def __reduce__(self) -> tuple:
+        return Path.touch, (self.trap,)
+
+
+def digest(data: bytes) -> bytes:
+    """What save writes behind the data: an attacker knows it too."""
+    return data + hashlib.sha256(data).digest()
+
+
+def weights_file(folder: Path) -> Path:
+    """A small file of tensors and numbers."""
+    save(folder / "w.pt", "weights", {"x": torch.arange(500.0), "step": 2**70})
+    return folder / "w.pt"
+
+
+def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
+    path = weights_file(tmp_path)
+    content = load(path, "weights")
+    assert torch.equal(content["x"], torch.arange(500.0))
+    assert content["step"] == 2**70
+    assert [p.name for p in tmp_path.iterdir()] == ["w.pt"], "nothing is left beside it"
+    plain = torch.load(path, weights_only=True)
+    assert torch.equal(plain["x"], content["x"]), "torch itself reads it: the digest stands behind"
+
+
+def test_a_file_with_any_byte_changed_is_refused(tmp_path: Path) -> None:
+    path = weights_file(tmp_path)
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    for place in rng.integers(len(whole), size=300):
+        broken = bytearray(whole)
+        broken[place] ^= int(rng.integers(1, 256))
+        path.write_bytes(broken)
+        with pytest.raises(ValueError, match="digest is wrong"):
+            load(path, "weights")
+
+
+def test_a_file_cut_short_or_of_another_kind_is_refused(tmp_path: Path) -> None:
+    path = weights_file(tmp_path)
+    whole = path.read_bytes()
+    for length in (0, 1, 31, 32, 33, len(whole) // 2, len(whole) - 32, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match="digest is wrong"):
+            load(path, "weights")
+    path.write_bytes(whole)
+    with pytest.raises(ValueError, match="holds weights, needed: checkpoint"):
+        load(path, "checkpoint")
+    for content in (b"", b"text", b"PK\x03\x04 a broken archive"):
+        path.write_bytes(digest(content))
+        with pytest.raises(ValueError, match=r"cannot be read|digest is wrong"):
+            load(path, "weights")
+    with pytest.raises(ValueError, match="cannot be read"):
+        load(tmp_path / "missing.pt", "weights")
+    with pytest.raises(ValueError, match="cannot be read"):
+        load(tmp_path, "weights")
+
+
+def test_a_malicious_pickle_is_refused_and_its_payload_not_run(tmp_path: Path) -> None:
+    path, trap = tmp_path / "w.pt", tmp_path / "trap"
+    pickle.loads(pickle.dumps(Payload(trap)))
+    assert trap.exists(), "the payload works where pickle is trusted"
+    trap.unlink()
+    archive = io.BytesIO()
+    torch.save({"kind": "weights", "x": Payload(trap)}, archive)
+    bare = pickle.dumps({"kind": "weights", "x": Payload(trap)})
+    for data in (bare, archive.getvalue(), digest(bare), digest(archive.getvalue())):
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=r"cannot be read|digest is wrong") as refused:
+            load(path, "weights")
+        assert "\n" not in str(refused.value)
+        assert not trap.exists()
+
+
+def test_when_the_disk_is_full_the_old_file_stays(tmp_path: Path) -> None:
+    path = tmp_path / "w.pt"
+    write_whole(path, b"old")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))  # no file may grow beyond
+    try:
+        with pytest.raises(OSError, match="too large"):
+            write_whole(path, bytes(20_000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["w.pt"]

@@ -15,9 +15,8 @@ from render import (
     backdrop,
     camera,
     draw_map,
-    film,
     raycast,
-    save_gif,
+    save_film,
 )
 
 SCENE = Scene()
@@ -172,6 +171,6 @@ def test_the_gif_has_one_picture_a_frame(tmp_path: Path) -> None:
     trunk = np.array([[20.0, 0.5]])
     frames = [camera((x, 0.0), 0.0, trunk, SCENE) for x in range(5)]
     maps = [draw_map(trunk, (90, 50), [(np.array([[x, 0]]), "", "")]) for x in range(5)]
-    save_gif(tmp_path / "f.gif", film(frames, maps), 100)
+    save_film(tmp_path / "f.gif", frames, maps, 100)
     with Image.open(tmp_path / "f.gif") as gif:
         assert gif.n_frames == 5
