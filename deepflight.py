@@ -3,11 +3,14 @@
     python deepflight.py train                  the default recipe, in the paper's world
     python deepflight.py train --beacon         the same with a visible goal
     python deepflight.py train --preset mnih    the paper's training parameters [Mnih15]
+    python deepflight.py train --resume DIR     go on with an interrupted training
     python deepflight.py eval                   fly weights/paper.pt against three other pilots
     python deepflight.py eval --beacon          fly weights/beacon.pt where the goal is visible
 
 Seeds: training plants forests from [0, 10^9), test points choose weights on [10^9, 2 * 10^9), and
 `eval` flies from 2 * 10^9 on unless told otherwise: forests that neither shaped nor chose weights.
+A run's folder holds config.json, log.csv, timing.csv, best.pt and checkpoint.pt, each whole at any
+time; while a training runs, it alone holds the folder's lock.
 Not in this file: anything about pictures (render.py), flying (env.py) or learning (dqn.py).
 """
 
