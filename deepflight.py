@@ -75,6 +75,8 @@ class Config:
     optimizer: str = setting("adam", "adam, or Mnih's rmsprop", "adam", "rmsprop")
     lr: float = setting(2.5e-4, "learning rate at first", 0, 1)
     lr_final: float = setting(2.5e-5, "and in the end, linear between", 0, 1)
+    huber: float = setting(100.0, "Huber's delta: larger errors pull no harder", 1e-3, 1e6)
+    huber_after: int = setting(100_000, "control steps before, with Mnih's delta of 1", 0, math.inf)
     optimizer_eps: float = setting(1.5e-4, "the optimizer's epsilon", 0, 1)
     max_grad_norm: float = setting(10.0, "longer gradients are cut to this; 0: never", 0, math.inf)
     precision: str = setting(PRECISION, "of the convolutions", "bfloat16", "float32")
@@ -102,7 +104,7 @@ MNIH = dict(
     steps=1_400_000, n=1, double=False, goal_value=0.0, far_value=0.0, mirror=False,
     target_every=10_000, replay=1_000_000, warmup=50_000, epsilon_final=0.1,
     epsilon_decay=1_000_000, optimizer="rmsprop", lr=2.5e-4, lr_final=2.5e-4, optimizer_eps=0.01,
-    max_grad_norm=0.0, precision="float32", test_every=20_000,
+    huber=1.0, max_grad_norm=0.0, precision="float32", test_every=20_000,
 )  # fmt: skip
 
 
@@ -195,8 +197,7 @@ COLUMNS = {  # a status line: key -> heading, format; log.csv has all but the cl
     "train_return": (" | train: return", "16.1f"), "train_steps": ("steps", "7.1f"),
     "test_return": (" | test: return", "15.1f"), "test_steps": ("steps", "7.1f"),
     "test_over_random": ("over random", "12.0%"), "test_progress": ("progress", "9.1f"),
-    "test_crash": ("crash", "6.0%"), "test_goal": ("goal", "6.0%"),
-    "test_left": ("left", "6.0%"), "test_time": ("time", "6.0%"),
+    **{f"test_{key}": (key, "6.0%") for key in ("crash", "goal", "left", "time")},
 }  # fmt: skip
 
 
@@ -244,16 +245,16 @@ class Training:
     def step(self) -> dict[str, float]:
         """One control step in every lane (line 6) and the updates then due; returns a log row."""
         c, book = self.c, self.book
-        book["step"] += c.lanes
-        eps = linear_schedule(book["step"], c.epsilon_start, c.epsilon_final, c.epsilon_decay)
-        lr = linear_schedule(book["step"], c.lr, c.lr_final, c.steps)
+        step = book["step"] = book["step"] + c.lanes
+        eps = linear_schedule(step, c.epsilon_start, c.epsilon_final, c.epsilon_decay)
+        lr = linear_schedule(step, c.lr, c.lr_final, c.steps)
+        delta = c.huber if step > c.huber_after else 1.0
         landed = self.advance(self.choose(eps))
         book["episodes"] += len(landed)
         book["recent"] = (book["recent"] + landed)[-100:]
-        due = times_due(book["step"], c.lanes, c.update_every) if book["step"] >= c.warmup else 0
-        for _ in range(due):
-            self.expect_finite(self.agent.learn(self.memory, lr, self.rngs[1]))
-        row = {"step": book["step"], "episodes": book["episodes"], "updates": self.agent.updates}
+        for _ in range(times_due(step, c.lanes, c.update_every) if step >= c.warmup else 0):
+            self.expect_finite(self.agent.learn(self.memory, lr, delta, self.rngs[1]))
+        row = {"step": step, "episodes": book["episodes"], "updates": self.agent.updates}
         means = {f"train_{key}": mean(book["recent"], key) for key in ("return", "steps")}
         return row | {"epsilon": eps} | means
 

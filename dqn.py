@@ -74,8 +74,7 @@ class QNetwork(nn.Module):
 @torch.no_grad()
 def greedy(q: QNetwork, s: np.ndarray) -> np.ndarray:
     """The actions (B,) of highest value in the states s (B, 4, 84, 84) uint8 (line 8)."""
-    device = next(q.parameters()).device
-    return q(torch.from_numpy(s).to(device)).argmax(1).cpu().numpy()
+    return q(torch.from_numpy(s).to(q.head[0].weight.device)).argmax(1).cpu().numpy()
 
 
 class Batch(NamedTuple):
@@ -206,8 +205,13 @@ class DQN(nn.Module):
         self.optimizer = make_optimizer(self.q, settings)
         self.worth = {DEAD: 0.0, GOAL: settings.goal_value, FAR: settings.far_value}
 
-    def learn(self, memory: Replay, lr: float, rng: np.random.Generator) -> float:
-        """One gradient step on a batch from memory (lines 12 to 15); returns its loss."""
+    def learn(self, memory: Replay, lr: float, delta: float, rng: np.random.Generator) -> float:
+        """One gradient step on a batch from memory (lines 12 to 15); returns its loss.
+
+        delta: of Huber's loss, a parabola up to there and straight beyond. 1 is Mnih's clipping of
+        errors; it is quick, but with values near 100 it learns the median of what may come, and a
+        rare crash does not move a median. A large delta learns the mean.
+        """
         c = self.settings
         batch = memory.sample(c.batch, c.n, c.gamma, rng)  # line 12
         if c.mirror:
@@ -219,7 +223,7 @@ class DQN(nn.Module):
             choose = self.q(s2, fast) if c.double else value  # (B, actions)
             y = td_target(r, discount, end, choose, value, self.worth)  # (B,) line 13
         q = self.q(s, fast).gather(1, a[:, None])[:, 0]  # (B,)
-        loss = F.smooth_l1_loss(q, y)  # line 14; Huber, which is Mnih's error clipping to [-1, 1]
+        loss = F.smooth_l1_loss(q, y, beta=delta)  # line 14, Huber's divided by delta
         self.optimizer.param_groups[0]["lr"] = lr
         self.optimizer.zero_grad()
         loss.backward()
