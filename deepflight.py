@@ -39,8 +39,8 @@ from env import OUTCOMES, ForestEnv, World, plant, refly
 
 TRAIN_END, TEST_FIRST, EVAL_FIRST = 10**9, 10**9, 2 * 10**9  # forest seeds
 CHECKPOINT = "checkpoint.pt"
-TORCH = str(torch.__version__)
 RANDOM_FLIGHTS = 2000  # a hundred would move the bar itself, random's mean flight, by a fifth
+TORCH = str(torch.__version__)
 # Where the processor has no bfloat16 of its own, float32 is faster.
 PRECISION = "bfloat16" if torch.cpu.get_capabilities().get("avx512_bf16") else "float32"
 
@@ -76,12 +76,13 @@ class Config:
     lr: float = setting(2.5e-4, "learning rate at first", 0, 1)
     lr_final: float = setting(2.5e-5, "and in the end, linear between", 0, 1)
     huber: float = setting(100.0, "Huber's delta: larger errors pull no harder", 1e-3, 1e6)
-    huber_after: int = setting(100_000, "control steps before, with Mnih's delta of 1", 0, math.inf)
+    huber_after: int = setting(100_000, "control steps with Mnih's delta of 1 before", 0, math.inf)
     optimizer_eps: float = setting(1.5e-4, "the optimizer's epsilon", 0, 1)
     max_grad_norm: float = setting(10.0, "longer gradients are cut to this; 0: never", 0, math.inf)
     precision: str = setting(PRECISION, "of the convolutions", "bfloat16", "float32")
     device: str = setting("cpu", "cpu; cuda is untested", "cpu", "cuda")
     threads: int = setting(2, "of torch; another number gives other last digits", 1, 256)
+    torch: str = setting(TORCH, "its version, noted here since others differ", TORCH)
     test_every: int = setting(5_000, "control steps between test points", 1, math.inf)
     test_forests: int = setting(48, "forests a test point", 1, 10_000)
     checkpoint_every: int = setting(5_000, "control steps between checkpoints", 1, math.inf)
@@ -93,10 +94,10 @@ class Config:
             if not legal:
                 text = " or ".join(allowed) if f.type is str else "{:g} to {:g}".format(*allowed)
                 raise ValueError(f"{f.name} is {value}, allowed: {text}")
-        least = self.lanes * (self.n + 4)  # a stack, a window, and the row after it
-        if min(self.replay, self.warmup) < least:
-            given = f"replay is {self.replay} and warmup {self.warmup}"
-            raise ValueError(f"{given}, allowed: at least lanes * (n + 4) = {least} each")
+        # The least: three rows to complete a stack, n that wait for rewards, one to draw.
+        given, least = min(self.replay, self.warmup), self.lanes * (self.n + 4)
+        if given < least:
+            raise ValueError(f"replay or warmup is {given}, below lanes * (n + 4) = {least}")
 
 
 # [Mnih15, Extended Data Table 1], as the paper says [DF II-B]; 1.4 M steps are the paper's own
@@ -142,7 +143,7 @@ def dynamic_window(bearings: ndarray, distances: ndarray, goal_bearing: float, w
     arcs = np.cumsum(world.speed * world.dt * np.exp(1j * headings), 1)  # (A, 15) m
     clearance = np.abs(arcs[..., None] - points).min(-1, initial=world.laser_range)  # (A, 15) m
     safe = np.logical_and.accumulate(clearance >= 0.8, 1).sum(1) * world.dt  # (A,) s
-    turn = goal_bearing - headings[:, -1]
+    turn = goal_bearing - headings[:, -1]  # (A,) rad
     error = np.abs(np.angle(np.exp(1j * turn)))  # (A,) rad, wrapped
     return int(np.argmax(10 * safe + 2 * np.minimum(clearance.min(1), 2) - 4 * error))
 
@@ -191,13 +192,13 @@ def mean(flights: Flights, key: str) -> float:
 # -------------------------------------------------- train
 
 END = {"": dqn.LIVE, "far": dqn.FAR, "goal": dqn.GOAL, "time": dqn.TRUNCATED}  # else DEAD
-COLUMNS = {  # a status line: key -> heading, format; log.csv has all but the clock's speed and eta
+COLUMNS = {  # a status line: key -> heading, format
     "step": ("step", "9,"), "episodes": ("episodes", "9,"), "epsilon": ("epsilon", "8.2f"),
     "speed": ("steps/s", "8.0f"), "eta": ("min left", "9.1f"),
     "train_return": (" | train: return", "16.1f"), "train_steps": ("steps", "7.1f"),
     "test_return": (" | test: return", "15.1f"), "test_steps": ("steps", "7.1f"),
     "test_over_random": ("over random", "12.0%"), "test_progress": ("progress", "9.1f"),
-    **{f"test_{key}": (key, "6.0%") for key in ("crash", "goal", "left", "time")},
+    **{f"test_{key}": (key, "8.0%") for key in ("crossed", "crash", "goal", "left", "time")},
 }  # fmt: skip
 
 
@@ -212,15 +213,14 @@ class Training:
     def __init__(self, c: Config, folder: Path) -> None:
         torch.set_num_threads(c.threads)
         self.c, self.folder, self.world, self.stopped = c, folder, World(beacon=c.beacon), 0
-        *self.rngs, self.bar_rng = np.random.default_rng(c.seed).spawn(3)  # fly, learn
-        self.tests = range(TEST_FIRST, TEST_FIRST + c.test_forests)
+        self.fly_rng, self.learn_rng, self.bar_rng = np.random.default_rng(c.seed).spawn(3)
+        self.test_seeds = range(TEST_FIRST, TEST_FIRST + c.test_forests)
         self.memory = Replay(c.replay, c.lanes)  # line 1
         self.agent = DQN(c, self.world.actions, c.seed)  # lines 2, 3
         self.envs = [ForestEnv(self.world) for _ in range(c.lanes)]
         self.flights: list[list] = [[] for _ in self.envs]
         self.plans: list[Iterator[int]] = [iter(()) for _ in self.envs]  # seeds flown before
-        self.book: dict = {"step": 0, "episodes": 0, "seconds": 0.0, "log": [], "timing": []}
-        self.book["recent"] = []  # flights, at most 100
+        self.book = dict(step=0, episodes=0, seconds=0.0, recent=[], log=[], timing=[])
 
     def stop(self, number: int, _frame: object) -> None:
         """A first Ctrl-C or SIGTERM lets the step end and saves; a second stops at once."""
@@ -229,16 +229,14 @@ class Training:
         self.stopped = number
 
     def begin(self) -> None:
-        """Measure the random pilot on the test forests, and take off in every lane."""
-        bar = measure(fly_random(self.tests, self.world, self.bar_rng))
-        self.book["bar"] = float(bar["steps"].mean())
+        """Take off in every lane, and save, so that all that follows can be interrupted."""
         for lane in range(self.c.lanes):
             self.take_off(lane)
         self.save()
 
     def take_off(self, lane: int) -> None:
         """Begin an episode (lines 4, 5) and its record, which grows as the drone flies."""
-        seed = next(self.plans[lane], int(self.rngs[0].integers(TRAIN_END)))
+        seed = next(self.plans[lane], int(self.fly_rng.integers(TRAIN_END)))
         self.envs[lane].reset(seed=seed)
         self.flights[lane].append((seed, self.envs[lane].actions))
 
@@ -253,7 +251,11 @@ class Training:
         book["episodes"] += len(landed)
         book["recent"] = (book["recent"] + landed)[-100:]
         for _ in range(times_due(step, c.lanes, c.update_every) if step >= c.warmup else 0):
-            self.expect_finite(self.agent.learn(self.memory, lr, delta, self.rngs[1]))
+            self.agent.learn(self.memory, lr, delta, self.learn_rng)
+        total = sum(p.sum().item() for p in self.agent.q.state_dict().values())
+        if not math.isfinite(total):  # as weights are after a loss that is no number
+            why = f"{total} at step {step:,}: learning rate too high or optimizer_eps too low?"
+            raise FloatingPointError(f"loss, weights: {why} Last good: {self.folder / CHECKPOINT}")
         row = {"step": step, "episodes": book["episodes"], "updates": self.agent.updates}
         means = {f"train_{key}": mean(book["recent"], key) for key in ("return", "steps")}
         return row | {"epsilon": eps} | means
@@ -261,8 +263,8 @@ class Training:
     def choose(self, eps: float) -> ndarray:
         """An action for every lane (L,), epsilon-greedily."""
         s = np.stack([env.observation for env in self.envs])  # (L, 4, 84, 84)
-        explore = self.rngs[0].random(len(s)) < eps  # (L,) line 7
-        anything = self.rngs[0].integers(self.world.actions, size=len(s))  # (L,)
+        explore = self.fly_rng.random(len(s)) < eps  # (L,) line 7
+        anything = self.fly_rng.integers(self.world.actions, size=len(s))  # (L,)
         return np.where(explore, anything, greedy(self.agent.q, s))  # (L,) line 8
 
     def advance(self, a: ndarray) -> Flights:
@@ -280,7 +282,7 @@ class Training:
     def test(self, row: dict[str, float]) -> dict[str, float]:
         """Fly the test forests greedily, log it, and keep the best weights; returns the log row."""
         book, log, q = self.book, self.book["log"], self.agent.q
-        flights = measure(fly("dqn", dqn_pilot(q), self.tests, self.world))
+        flights = measure(fly("dqn", dqn_pilot(q), self.test_seeds, self.world))
         row |= {f"test_{key}": float(values.mean()) for key, values in flights.items()}
         log.append(row | {"test_over_random": row["test_steps"] / book["bar"] - 1})
         book["timing"].append({"step": book["step"], "seconds": round(book["seconds"], 1)})
@@ -291,24 +293,19 @@ class Training:
             save_weights(self.folder / "best.pt", q, self.c.beacon)
         return log[-1]
 
-    def expect_finite(self, x: float) -> None:
-        """Stop before anything that is not a number reaches a file."""
-        if not math.isfinite(x):
-            why = f"step {self.book['step']:,}: learning rate too high or optimizer_eps too low?"
-            last = f"The last good checkpoint is {self.folder / CHECKPOINT}"
-            raise FloatingPointError(f"loss or weights are {x} at {why} {last}")
-
-    def save(self) -> None:
-        """Write the checkpoint: 27 MB, and one byte for each step in the replay."""
-        self.expect_finite(sum(p.sum().item() for p in self.agent.q.state_dict().values()))
-        for lane in self.flights:  # forget the flights whose last frame is overwritten
+    def record(self) -> list[list[tuple[int, str]]]:
+        """Of every lane, the seed and actions of each flight that has a frame in the replay."""
+        for lane in self.flights:
             while sum(len(actions) for _, actions in lane[1:]) >= self.memory.rows:
                 lane.pop(0)
-        flights = [[(seed, "".join(map(str, a))) for seed, a in lane] for lane in self.flights]
-        content = {"config": asdict(self.c), "torch": TORCH, "book": self.book, "flights": flights}
-        content |= {"rngs": [rng.bit_generator.state for rng in self.rngs]}
-        content |= {"agent": self.agent.state_dict(), "updates": self.agent.updates}
-        content |= {"optimizer": self.agent.optimizer.state_dict(), "added": self.memory.added}
+        return [[(seed, "".join(map(str, a))) for seed, a in lane] for lane in self.flights]
+
+    def save(self) -> None:
+        """Write the checkpoint: 27 MB, and about one byte for each step in the replay."""
+        content = {"config": asdict(self.c), "book": self.book, "added": self.memory.added}
+        content |= {"flights": self.record(), "agent": self.agent.state_dict()}
+        content |= {"optimizer": self.agent.optimizer.state_dict(), "updates": self.agent.updates}
+        content |= {"rngs": [r.bit_generator.state for r in (self.fly_rng, self.learn_rng)]}
         save(self.folder / CHECKPOINT, "checkpoint", content)
 
     def restore(self, saved: dict) -> None:
@@ -324,36 +321,40 @@ class Training:
         for row in range(-rows, 0):
             show(f"flying the replay again: {row * -len(digits):,} steps to go")
             self.advance(np.array([int(actions[row]) for actions in digits]))
+        if self.record() != saved["flights"]:
+            raise ValueError(f"{self.folder}: its flights fly otherwise here; another machine?")
         self.book, self.agent.updates = saved["book"], saved["updates"]
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
-        for rng, state in zip(self.rngs, saved["rngs"], strict=True):
+        for rng, state in zip((self.fly_rng, self.learn_rng), saved["rngs"], strict=True):
             rng.bit_generator.state = state
 
 
-def train(run: Training, saved: dict | None) -> int:
+def train(run: Training) -> int:
     """Algorithm 1 of [Mnih15], over c.lanes forests at once; its line numbers are in dqn.py.
 
-    Goes on from a checkpoint if there is one; returns the exit code.
+    Returns the exit code: 0, or 128 and the signal that interrupted it.
     """
     c = run.c
-    print(f"to {run.folder}; its best.pt always holds the best weights so far", flush=True)
-    run.restore(saved) if saved else run.begin()
+    if "bar" not in run.book:  # mean flight time of the random pilot, in steps
+        bar = fly_random(run.test_seeds, run.world, run.bar_rng)
+        run.book["bar"] = float(measure(bar)["steps"].mean())
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, run.stop)
-    print("\n" + "".join(f"{head:>{len(format(0, form))}}" for head, form in COLUMNS.values()))
+    print(f"to {run.folder}; its best.pt always holds the best weights so far\n")
+    print("".join(f"{head:>{len(format(0, form))}}" for head, form in COLUMNS.values()), flush=True)
     start = time.perf_counter() - run.book["seconds"]
     while run.book["step"] < c.steps and not run.stopped:
         row = run.step()
         step, seconds = row["step"], time.perf_counter() - start
-        run.book["seconds"] = seconds
         speed = {"speed": step / seconds, "eta": max(c.steps - step, 0) * seconds / step / 60}
         show(status(row | speed))
         if times_due(step, c.lanes, c.test_every) or step >= c.steps:
             print(status(run.test(row) | speed), flush=True)
+        run.book["seconds"] = time.perf_counter() - start
         if times_due(step, c.lanes, c.checkpoint_every) or step >= c.steps or run.stopped:
             run.save()
-    if not run.stopped:
+    if run.book["step"] >= c.steps:
         return 0
     again = [sys.orig_argv[0], sys.argv[0], "train", "--resume", str(run.folder)]
     print(f"\nsaved at step {run.book['step']:,}; to go on:\n{shlex.join(again)}")
@@ -431,7 +432,7 @@ def evaluate(args: argparse.Namespace) -> int:
     if args.json:
         head = {"weights": str(args.weights), "beacon": args.beacon, "first_seed": seeds[0]}
         report = {p: figures[p] | {"flights": flights[p]} for p in flights}
-        text = json.dumps(head | {"forests": len(seeds), "pilots": report}) + "\n"
+        text = json.dumps(head | {"forests": len(seeds), "pilots": report})
         write_whole(args.json, text.encode())
     return 0
 
@@ -443,7 +444,7 @@ def summarize(flights: Flights, bar: Flights, forests: int, rng: np.random.Gener
     shares have Wilson's interval, which takes flights as independent: one flight a forest is.
     """
     table, random_steps = measure(flights), per_forest(measure(bar)["steps"], forests)
-    draws = rng.integers(forests, size=(2000, forests))  # resampled forests
+    draws = rng.integers(forests, size=(2000, forests))  # (2000, F) resampled forests
     means = {key: per_forest(table[key], forests) for key in ("steps", "progress", "return")}
     figures = {key: interval(x.mean(), x[draws].mean(1)) for key, x in means.items()}
     ratios = means["steps"][draws].mean(1) / random_steps[draws].mean(1)
@@ -545,14 +546,15 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def prepare_train(args: argparse.Namespace) -> Callable[[], int]:
-    """Check everything and make or reopen the run's folder, before anything flies."""
+    """Check everything and make or reopen the run's folder."""
     given = {f.name: getattr(args, f.name) for f in fields(Config) if hasattr(args, f.name)}
     given = (MNIH if args.preset == "mnih" else {}) | given
     if args.resume:
         saved = load(args.resume / CHECKPOINT, "checkpoint")
-        run = Training(agreed(saved, given | {"torch": TORCH}, args.resume), args.resume)
-        run.lock = lock_folder(run.folder)
-        return lambda: train(run, saved)
+        run = Training(agreed(saved, given, args.resume), args.resume)
+        run.lock = lock_folder(args.resume)
+        run.restore(saved)
+        return lambda: train(run)
     c = Config(**given)
     if c.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device is 'cuda', but torch finds none here: use cpu")
@@ -562,33 +564,33 @@ def prepare_train(args: argparse.Namespace) -> Callable[[], int]:
         raise ValueError(f"name is {args.name!r}, allowed is that of a new folder in runs/")
     run = Training(c, folder)  # before the folder is made, for memory may not suffice
     folder.mkdir(parents=True)
-    text = json.dumps({"preset": args.preset, "torch": TORCH} | asdict(c), indent=2) + "\n"
+    text = json.dumps({"preset": args.preset} | vars(c), indent=2)
     write_whole(folder / "config.json", text.encode())
     run.lock = lock_folder(folder)
-    return lambda: train(run, None)
+    run.begin()
+    return lambda: train(run)
 
 
 def agreed(saved: dict, given: dict[str, Any], folder: Path) -> Config:
     """The settings of a checkpoint, if nothing that is given now contradicts them."""
-    there = saved["config"] | {"torch": saved["torch"]}
-    differ = [f"{key} is {x}, was {there[key]}" for key, x in given.items() if x != there[key]]
+    c, was = Config(**saved["config"] | given), saved["config"]
+    differ = ", ".join(f"{k} {x}, was {was.get(k)}" for k, x in vars(c).items() if x != was.get(k))
     if differ:
-        differ = ", ".join(differ)
         raise ValueError(f"{folder} has other settings: {differ}; leave them out or begin anew")
-    if saved["book"]["step"] >= there["steps"]:
-        raise ValueError(f"{folder} has flown all of its {there['steps']:,} steps")
-    return Config(**saved["config"])
+    if saved["book"]["step"] >= c.steps:
+        raise ValueError(f"{folder} has flown all of its {c.steps:,} steps")
+    return c
 
 
 def lock_folder(folder: Path) -> sqlite3.Connection:
-    """Keep a second training out until this one ends, however it ends.
+    """Keep a second training out as long as what this returns is held, however it is let go.
 
     SQLite's lock is the one in the standard library that works everywhere and dies with its owner.
     """
-    lock = sqlite3.connect(folder / "lock", timeout=0, isolation_level=None)
     try:
+        lock = sqlite3.connect(folder / "lock", timeout=0, isolation_level=None)
         lock.execute("BEGIN EXCLUSIVE")
-    except sqlite3.OperationalError as error:
+    except sqlite3.Error as error:
         raise ValueError(f"{folder} is another training's, or cannot be held: {error}") from None
     return lock
 
@@ -596,8 +598,7 @@ def lock_folder(folder: Path) -> sqlite3.Connection:
 def prepare_eval(args: argparse.Namespace) -> Callable[[], int]:
     """Check everything and read the weights, before anything flies."""
     if args.episodes < 1 or args.first_seed < 0:
-        given = f"episodes is {args.episodes}, first-seed {args.first_seed}"
-        raise ValueError(f"{given}, allowed: from 1 and from 0")
+        raise ValueError(f"episodes {args.episodes} < 1 or first-seed {args.first_seed} < 0")
     if args.json and (args.json.is_dir() or not args.json.absolute().parent.is_dir()):
         raise ValueError(f"{args.json} cannot be written: it needs an existing folder")
     shipped = Path(__file__).parent / "weights" / ("beacon.pt" if args.beacon else "paper.pt")

@@ -136,19 +136,19 @@ class Replay:
             live = self.ends[last, lane] == LIVE  # (B,)
             last = np.where(live, (last + 1) % self.rows, last)
             power = np.where(live, power * np.float32(gamma), power)
-            r = r + live * power * self.rewards[last, lane]
+            r = r + live * power * self.rewards[last, lane]  # (B,)
         end = self.ends[last, lane]  # (B,)
-        s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), lane)
+        s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), lane)  # (B, 4, 84, 84)
         for i in np.flatnonzero(end == TRUNCATED):
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], lane[i]]]
-        a = self.actions[row, lane].astype(np.int64)
+        a = self.actions[row, lane].astype(np.int64)  # (B,)
         return Batch(self.stack(row, lane), a, r, s2, power * np.float32(gamma), end)
 
     def stack(self, row: np.ndarray, lane: np.ndarray) -> np.ndarray:
         """The states (B, 4, 84, 84) at row (B,), lane (B,); an episode's first frame repeats."""
         rows = [row]
         for _ in range(3):
-            before = (rows[0] - 1) % self.rows
+            before = (rows[0] - 1) % self.rows  # (B,)
             rows.insert(0, np.where(self.ends[before, lane] == LIVE, before, rows[0]))
         return self.frames[np.stack(rows, 1), lane[:, None]]
 
@@ -205,8 +205,8 @@ class DQN(nn.Module):
         self.optimizer = make_optimizer(self.q, settings)
         self.worth = {DEAD: 0.0, GOAL: settings.goal_value, FAR: settings.far_value}
 
-    def learn(self, memory: Replay, lr: float, delta: float, rng: np.random.Generator) -> float:
-        """One gradient step on a batch from memory (lines 12 to 15); returns its loss.
+    def learn(self, memory: Replay, lr: float, delta: float, rng: np.random.Generator) -> None:
+        """One gradient step on a batch from memory (lines 12 to 15).
 
         delta: of Huber's loss, a parabola up to there and straight beyond. 1 is Mnih's clipping of
         errors; it is quick, but with values near 100 it learns the median of what may come, and a
@@ -216,14 +216,15 @@ class DQN(nn.Module):
         batch = memory.sample(c.batch, c.n, c.gamma, rng)  # line 12
         if c.mirror:
             batch = mirror(batch, rng.random(c.batch) < 0.5, self.actions)
-        s, a, r, s2, discount, end = (torch.from_numpy(x).to(c.device) for x in batch)
+        s, a, r, s2, discount, end = (torch.from_numpy(x).to(c.device) for x in batch)  # as there
         fast = c.precision == "bfloat16"
         with torch.no_grad():
             value = self.q_target(s2, fast)  # (B, actions)
             choose = self.q(s2, fast) if c.double else value  # (B, actions)
             y = td_target(r, discount, end, choose, value, self.worth)  # (B,) line 13
         q = self.q(s, fast).gather(1, a[:, None])[:, 0]  # (B,)
-        loss = F.smooth_l1_loss(q, y, beta=delta)  # line 14, Huber's divided by delta
+        # Huber's loss over delta (line 14), so that no error pulls harder than 1.
+        loss = F.smooth_l1_loss(q, y, beta=delta)
         self.optimizer.param_groups[0]["lr"] = lr
         self.optimizer.zero_grad()
         loss.backward()
@@ -233,7 +234,6 @@ class DQN(nn.Module):
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.q_target.load_state_dict(self.q.state_dict())  # line 15
-        return loss.item()
 
 
 def make_optimizer(q: QNetwork, c: Any) -> torch.optim.Optimizer:

@@ -41,11 +41,11 @@ STACK = 4  # frames in an observation [DF §II-A]
 OUTCOMES = ("crash", "goal", "left", "time")  # tested in this order
 
 
-# Least and most of a world's numbers that may be other than 0.001 to 10,000.
+# Least and most of a world's numbers that may be other than 0.001 to 10,000. An action is a digit.
 LIMITS = dict.fromkeys(("first_x", "first_y", "r_safe", "r_precrash", "r_crash"), (-1e4, 1e4))
 LIMITS |= dict.fromkeys(("back", "jitter_x", "jitter_y", "beacon_pixels", "yaw_rate"), (0, 1e4))
 LIMITS |= dict.fromkeys(("sky", "ground", "trunk_facing", "trunk_grazing", "beacon_grey"), (0, 255))
-LIMITS |= {"rows": (0, 1e4), "columns": (0, 1e4), "beacon": (0, 1), "actions": (2, 10)}  # digits
+LIMITS |= {"rows": (0, 1e4), "columns": (0, 1e4), "beacon": (0, 1), "actions": (2, 10)}
 
 
 @dataclass(frozen=True)
@@ -81,16 +81,18 @@ class World(Scene):
     def __post_init__(self) -> None:
         for f in fields(self):
             value, (low, high) = getattr(self, f.name), LIMITS.get(f.name, (1e-3, 1e4))
-            if not (low <= value <= high and f.type(value) == value):
+            if not (isinstance(value, f.type | int) and low <= value <= high):
                 legal = f"{f.type.__name__} from {low:g} to {high:g}"
                 raise ValueError(f"{f.name} is {value}, allowed: {legal}")
+        # A stride is below reach, or the drone could step over a trunk's middle.
         reach, spread = self.trunk_radius + self.d_crash, (self.jitter_x, self.jitter_y)  # m
         nearest = np.hypot(*np.maximum(np.abs(grid(self)) - spread, 0).T).min(initial=math.inf)
         for small, big, rule in (
-            (self.speed * self.dt, reach, "speed * dt < trunk_radius + d_crash, to step over none"),
+            (self.speed * self.dt, reach, "speed * dt < trunk_radius + d_crash"),
             (reach, nearest, "trunk_radius + d_crash < the way from the start to any trunk"),
             (2 * self.d_crash, self.width, "2 * d_crash < width"),
             (self.d_crash, self.d_neg, "d_crash < d_neg"),
+            (self.d_neg, self.laser_range, "d_neg < laser_range"),
         ):
             if not small < big:
                 raise ValueError(f"a legal world has {rule}; here they are {small:g} and {big:g}")

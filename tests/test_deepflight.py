@@ -114,7 +114,8 @@ def test_the_mnih_preset_is_extended_data_table_1() -> None:
     assert (c.epsilon_start, c.epsilon_final, c.epsilon_decay) == (1.0, 0.1, 1_000_000)
     assert (c.update_every, c.target_every, c.gamma) == (4, 10_000, 0.99)
     assert (c.optimizer, c.lr, c.lr_final, c.optimizer_eps) == ("rmsprop", 2.5e-4, 2.5e-4, 0.01)
-    assert (c.n, c.double, c.mirror) == (1, False, False)
+    assert (c.n, c.double, c.mirror, c.huber) == (1, False, False, 1.0)
+    assert (c.max_grad_norm, c.precision) == (0.0, "float32")
     assert (c.goal_value, c.far_value) == (0.0, 0.0)
 
 

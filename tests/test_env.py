@@ -250,6 +250,9 @@ def test_a_flight_that_is_over_or_not_begun_cannot_go_on() -> None:
         ({"actions": 11}, "actions"),
         ({"jitter_y": -1.0}, "jitter_y"),
         ({"d_neg": 0.5}, "d_neg"),
+        ({"laser_range": 0.5}, "laser_range"),
+        ({"actions": 9.0}, "actions"),
+        ({"speed": "fast"}, "speed"),
         ({"sky": 256}, "sky"),
         ({"max_steps": 0}, "max_steps"),
     ],
@@ -282,6 +285,14 @@ WORLDS = st.builds(
     speed=st.floats(0.1, 10),
     yaw_rate=st.floats(0, 3),
     goal_radius=st.floats(0.1, 5),
+    back=st.floats(0, 5),
+    dt=st.floats(0.02, 0.5),
+    d_crash=st.floats(0.1, 2),
+    d_neg=st.floats(0.5, 4),
+    laser_range=st.floats(1, 30),
+    r_safe=st.floats(-1, 1),
+    r_precrash=st.floats(-10, 0),
+    r_crash=st.floats(-20, 0),
     max_steps=st.integers(1, 40),
     beacon=st.booleans(),
 )
@@ -321,5 +332,6 @@ def keeps_the_rules(env: ForestEnv, observation: np.ndarray, r: float) -> None:
         assert env.outcome == (expected or "")
         assert (env.edge != "") == (env.outcome == "left")
         r_goal = 1 - env.d_goal / world.length
-        live = world.r_precrash + r_goal - 1e-9 <= r <= world.r_safe + r_goal + 1e-9
+        low, high = min(world.r_safe, world.r_precrash), max(world.r_safe, 0)
+        live = low - 1e-9 <= r - r_goal <= high + 1e-9
         assert r == world.r_crash if env.outcome in ("crash", "left") else live
