@@ -1,0 +1,74 @@
+"""The README's numbers are those of the committed results, so that neither can go stale."""
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+import deepflight
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+FIGURES = {  # of eval's JSON -> label in the README, factor, digits
+    "over_random": ("flight time over random", 100, 0),
+    "crossed": ("crossed (arrived, or left by the far edge)", 100, 1),
+    "goal": ("arrived", 100, 1),
+    "crash": ("crashed", 100, 1),
+    "progress": ("mean progress", 1, 1),
+}
+
+
+def report(name: str) -> dict:
+    """What `eval --json results/NAME.json` wrote."""
+    return json.loads((ROOT / f"results/{name}.json").read_text())
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_each_row_of_the_headline_table_is_what_eval_wrote(figure: str) -> None:
+    label, factor, digits = FIGURES[figure]
+    unit = " m" if figure == "progress" else " %"
+    row = f"| {label} |"
+    for name, pilot in (("paper", "dqn"), ("beacon", "dqn"), ("pilots", "laser")):
+        x = {
+            k: f"{factor * v:.{digits}f}" for k, v in report(name)["pilots"][pilot][figure].items()
+        }
+        sign = "+" if figure == "over_random" else ""
+        row += f" {sign}{x['value']}{unit} [{x['low']}, {x['high']}] |"
+    assert row in README
+
+
+@pytest.mark.parametrize("name", ["paper", "beacon", "pilots"])
+def test_headline_numbers_come_from_500_forests_that_nothing_else_has_flown(name: str) -> None:
+    assert report(name)["forests"] == 500
+    assert report(name)["first_seed"] == 3 * 10**9
+
+
+def test_the_first_table_is_what_eval_prints(capsys: pytest.CaptureFixture) -> None:
+    shown = report("eval")
+    deepflight.print_table(shown["pilots"])
+    table = capsys.readouterr().out
+    assert table in README
+    head = f"{shown['forests']} forests from seed {shown['first_seed']}; the random pilot flies"
+    assert head in README
+
+
+def test_what_the_readme_says_of_veering_is_what_was_measured() -> None:
+    measured = json.loads((ROOT / "results/veer.json").read_text())["pilots"]["dqn"]
+    for name, factor, digits in (
+        ("one side free", 1, 3),
+        ("towards middle", 1, 3),
+        ("edge time", 100, 1),
+    ):
+        x = {k: f"{factor * v:.{digits}f}" for k, v in measured[name].items()}
+        unit = "%" if name == "edge time" else "rad/s"
+        assert f"{x['value']} {unit} [{x['low']}, {x['high']}]" in README.replace("\n", " ")
+
+
+def test_the_readme_counts_how_the_headline_flights_ended() -> None:
+    ends = Counter(f["edge"] or f["outcome"] for f in report("paper")["pilots"]["dqn"]["flights"])
+    counts = (
+        "of 500 flights {far} left by the far edge, {side} by a side, {back} by the back; {goal} "
+    )
+    counts += "arrived, {crash} crashed and {time} ran out of time"
+    assert counts.format(**ends) in README.replace("\n", " ")
