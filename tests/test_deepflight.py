@@ -16,6 +16,7 @@ import deepflight
 from deepflight import (
     MNIH,
     Config,
+    Training,
     dynamic_window,
     fly,
     fly_random,
@@ -56,7 +57,7 @@ def test_the_laser_pilot_turns_away_from_a_trunk_ahead() -> None:
 
 
 def test_the_laser_pilot_arrives_and_never_crashes() -> None:
-    flights = fly("laser", laser_pilot, range(2 * 10**9, 2 * 10**9 + 20), WORLD)
+    flights = fly("laser", laser_pilot, range(2 * 10**9, 2 * 10**9 + 20), WORLD, camera=False)
     assert not any(f["outcome"] == "crash" for f in flights)
     assert sum(f["outcome"] == "goal" for f in flights) >= 17
 
@@ -219,11 +220,11 @@ def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
 
 # -------------------------------------------------- train
 
-SHORT = ("--steps", 1200, "--warmup", 400, "--test-every", 400, "--test-forests", 4, "--threads", 1)
+SHORT = ("--warmup", 400, "--test-every", 400, "--test-forests", 4, "--threads", 1, "--batch", 16)
 
 
 def test_twenty_seconds_of_training_through_the_real_command_line(tmp_path: Path) -> None:
-    done = command("train", *SHORT, "--name", "first", folder=tmp_path)
+    done = command("train", "--steps", 1200, *SHORT, "--name", "first", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     run = tmp_path / "runs" / "first"
     files = {"best.pt", "checkpoint.pt", "config.json", "lock", "log.csv", "timing.csv"}
@@ -239,15 +240,22 @@ def test_twenty_seconds_of_training_through_the_real_command_line(tmp_path: Path
     deepflight.load_weights(run / "best.pt", beacon=False)
     log = (run / "log.csv").read_bytes()
 
-    again = command("train", *SHORT, "--name", "first", folder=tmp_path)
+    again = command("train", "--steps", 1200, *SHORT, "--name", "first", folder=tmp_path)
     assert again.returncode == 2, "an existing run is never overwritten"
     assert (run / "log.csv").read_bytes() == log
 
-    command("train", *SHORT, folder=tmp_path)
+    command("train", "--steps", 1200, *SHORT, folder=tmp_path)
     assert (tmp_path / "runs/001/log.csv").read_bytes() == log, "same seed, same bytes"
 
-    command("train", *SHORT, "--seed", 1, folder=tmp_path)
-    assert (tmp_path / "runs/002/log.csv").read_bytes() != log, "another seed, another training"
+
+def test_another_seed_is_another_network_in_other_forests(tmp_path: Path) -> None:
+    runs = []
+    for seed in (0, 1):
+        (tmp_path / str(seed)).mkdir()
+        runs.append(Training(Config(seed=seed, threads=1), tmp_path / str(seed)))
+        runs[-1].begin()
+    assert runs[0].record() != runs[1].record()
+    assert (runs[0].agent.q.head[2].weight != runs[1].agent.q.head[2].weight).all()
 
 
 # -------------------------------------------------- eval

@@ -264,8 +264,8 @@ def test_clipped_errors_learn_the_median_and_squared_ones_the_mean(
     agent, memory, rng = DQN(SETTINGS, 2, seed=0), Replay(1000, 1), np.random.default_rng(0)
     for step in range(1000):  # one step an episode, and one in ten of them ends badly
         memory.add(stripe(1)[None], np.zeros(1), [-100.0 * (step % 10 == 0)], [stripe(1)], [DEAD])
-    for update in range(300):
-        agent.learn(memory, linear_schedule(update, 1e-3, 1e-5, 300), delta, rng)
+    for update in range(150):
+        agent.learn(memory, linear_schedule(update, 2e-3, 1e-5, 150), delta, rng)
     q = agent.q(torch.from_numpy(stripe(1))[None])[0, 0].item()
     assert q == pytest.approx(learnt, abs=1.5)
 
