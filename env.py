@@ -14,9 +14,9 @@
     |---------------------------------|--------------------------------------------|--------------|
     | safe                            | r_safe = +0.25                             | > 2.0 m      |
     | too close                       | r_neg = 0 falling to r_precrash = -5       | 2.0 - 0.75 m |
-    | and always, the way to the goal | r_goal = 1 - d_goal / d_max                |              |
-    | crash, or out of the forest     | r_crash = -10 and nothing else; the end    | < 0.75 m     |
-    | arrival, or out of time         | as on every live step; the end             | any          |
+    | and in both, the way to go      | r_goal = 1 - d_goal / d_max                |              |
+    | crash, or out at any d_obs      | r_crash = -10 and nothing else; the end    | < 0.75 m     |
+    | arrival, or out of time         | as on every live step; the end             | >= 0.75 m    |
 
 pymunk moves the drone and measures d_obs; render.py looks. [DF] is the Deep Flight paper.
 Legend: d_obs is the distance from the drone's centre to the nearest bark, at most the laser's 20 m,

@@ -1,5 +1,6 @@
 """The README's numbers are those of the committed results, so that neither can go stale."""
 
+import csv
 import json
 from collections import Counter
 from pathlib import Path
@@ -72,3 +73,15 @@ def test_the_readme_counts_how_the_headline_flights_ended() -> None:
     )
     counts += "arrived, {crash} crashed and {time} ran out of time"
     assert counts.format(**ends) in README.replace("\n", " ")
+
+
+def test_the_five_seeds_figures_are_those_of_their_logs_and_flights() -> None:
+    first, confirmed = [], []
+    for seed in range(5):
+        rows = list(csv.DictReader((ROOT / f"results/seeds/{seed}.csv").open()))
+        early = [float(row["test_over_random"]) for row in rows if int(row["step"]) <= 25_000]
+        first.append(f"{100 * next(x for x in early if x > 1.8):+.0f}")
+        over = report(f"seeds/{seed}")["pilots"]["dqn"]["over_random"]["value"]
+        confirmed.append(f"{100 * over:+.0f}")
+    for figures in (first, confirmed):
+        assert f"{', '.join(figures[:4])} and {figures[4]} %" in README.replace("\n", " ")
