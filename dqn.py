@@ -27,6 +27,7 @@ the code below and the training loop in deepflight.py carry these numbers.
 Legend: s, a state and action; r the sum of the next n discounted rewards (n = 1: the reward);
 s2 the state after them; gamma the discount of a step, discount that of s2: gamma to the number of
 rewards in r; end how these ended; y the target; B batch, T rows and L lanes of the replay.
+At the end, the two functions that write and read files of tensors so that none is ever half there.
 Not in this file: prioritized replay, distributional values, noisy layers.
 """
 
@@ -216,7 +217,8 @@ class DQN(nn.Module):
         batch = memory.sample(c.batch, c.n, c.gamma, rng)  # line 12
         if c.mirror:
             batch = mirror(batch, rng.random(c.batch) < 0.5, self.actions)
-        s, a, r, s2, discount, end = (torch.from_numpy(x).to(c.device) for x in batch)  # as there
+        # In the shapes of Batch:
+        s, a, r, s2, discount, end = (torch.from_numpy(x).to(c.device) for x in batch)
         fast = c.precision == "bfloat16"
         with torch.no_grad():
             value = self.q_target(s2, fast)  # (B, actions)

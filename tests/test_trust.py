@@ -125,21 +125,20 @@ def test_ten_times_taken_up_again_is_never_interrupted(tmp_path: Path) -> None:
         assert np.array_equal(*(getattr(run.memory, name) for run in runs)), name
 
 
-def test_a_truncated_flight_comes_back_with_its_last_frame(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    slow = World(max_steps=3)
-    monkeypatch.setattr(deepflight, "World", lambda beacon: slow)
-    run = Training(Config(**SMALL), tmp_path)
-    begin(run)
-    fly_until(run, 160)
-    run.save()
-    again = Training(Config(**SMALL), tmp_path)
-    again.restore(load(tmp_path / CHECKPOINT, "checkpoint"))
-    assert run.memory.last_frames
-    assert run.memory.last_frames.keys() == again.memory.last_frames.keys()
-    for key, frame in run.memory.last_frames.items():
-        assert np.array_equal(frame, again.memory.last_frames[key])
+def test_a_truncated_flight_comes_back_with_its_last_frame(tmp_path: Path) -> None:
+    runs = [Training(Config(**SMALL), tmp_path) for _ in range(2)]
+    for run in runs:
+        run.world = World(max_steps=3)
+        run.envs = [ForestEnv(run.world) for _ in run.envs]
+    begin(runs[0])
+    fly_until(runs[0], 160)
+    runs[0].save()
+    runs[1].restore(load(tmp_path / CHECKPOINT, "checkpoint"))
+    kept, restored = (run.memory.last_frames for run in runs)
+    assert kept
+    assert kept.keys() == restored.keys()
+    for key, frame in kept.items():
+        assert np.array_equal(frame, restored[key])
 
 
 def test_a_checkpoint_keeps_no_frames_but_a_byte_a_step_or_two(tmp_path: Path) -> None:
