@@ -143,16 +143,14 @@ class ForestEnv:
     """
 
     def __init__(self, world: World | None = None, *, camera: bool = True) -> None:
-        self.world = world or World()
-        self.has_camera = camera
-        self.goal = (self.world.length, 0.0)  # m, mid of the far edge
+        self.world, self.has_camera = world or World(), camera
+        self.goal = pymunk.Vec2d(self.world.length, 0.0)  # m, mid of the far edge
         self.space = pymunk.Space()
         ground, radius = self.space.static_body, self.world.trunk_radius
         self.bark = [pymunk.Circle(ground, radius) for _ in plant(0, self.world)]
         self.drone = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self.space.add(self.drone, *self.bark)
-        self.seed = -1  # none flown yet
-        self.outcome = "not reset"
+        self.seed, self.outcome = -1, "not reset"
 
     def reset(self, *, seed: int | None = None, options: object = None) -> tuple[ndarray, dict]:
         """Plant forest number `seed`, or the one after the last, and stand at the start.
@@ -164,7 +162,7 @@ class ForestEnv:
         for circle, centre in zip(self.bark, self.trunks.tolist(), strict=True):
             circle.unsafe_set_offset(centre)  # a tenth of the time of new circles
         self.space.reindex_static()
-        self.drone.position, self.drone.angle = (0.0, 0.0), 0.0
+        self.drone.position, self.drone.angle, self.centre = (0.0, 0.0), 0.0, (math.inf, 0.0)
         self.actions: list[int] = []
         self.progress, self.total, self.outcome, self.edge = 0.0, 0.0, "", ""
         self._measure()
@@ -195,14 +193,13 @@ class ForestEnv:
         """The laser's beams: bearings from the heading (360,) rad, counter-clockwise from dead
         ahead, and distances (360,) m, 20 where nothing is hit."""
         bearings = np.arange(self.world.beams) * (2 * math.pi / self.world.beams)  # (360,)
-        offsets = self.trunks - self.drone.position  # (N, 2)
+        offsets = self._around() - self.drone.position  # (K, 2)
         distance, _ = raycast(offsets, self.world.trunk_radius, bearings + self.drone.angle)
         return bearings, np.minimum(distance, self.world.laser_range)
 
     def goal_bearing(self) -> float:
         """Angle from the heading to the goal, rad in [-pi, pi], positive to the left."""
-        x, y = self.drone.position
-        turn = math.atan2(self.goal[1] - y, self.goal[0] - x) - self.drone.angle
+        turn = (self.goal - self.drone.position).angle - self.drone.angle
         return math.remainder(turn, 2 * math.pi)
 
     def flight(self) -> dict:
@@ -213,8 +210,8 @@ class ForestEnv:
 
     def _move(self, yaw_rate: float) -> None:
         heading = self.drone.angle + yaw_rate * self.world.dt  # turn first, then fly
-        vx, vy = self.world.speed * math.cos(heading), self.world.speed * math.sin(heading)
-        self.drone.angular_velocity, self.drone.velocity = yaw_rate, (vx, vy)
+        self.drone.velocity = pymunk.Vec2d.from_polar(self.world.speed, heading)
+        self.drone.angular_velocity = yaw_rate
         self.space.step(self.world.dt)
         self.progress = max(self.progress, self.drone.position.x)
 
@@ -232,15 +229,24 @@ class ForestEnv:
         x, y = self.drone.position
         far, back, side = x > self.world.length, x < -self.world.back, abs(y) > self.world.width / 2
         self.edge = "far" if far else "back" if back else "side" if side else ""
-        if self.edge:
-            return "left"
-        return "time" if len(self.actions) >= self.world.max_steps else ""
+        late = len(self.actions) >= self.world.max_steps
+        return "left" if self.edge else "time" if late else ""
 
     def _look(self) -> ndarray:
         if not self.has_camera:
             return np.zeros((PIXELS, PIXELS), np.uint8)
         beacon = self.goal if self.world.beacon else None
-        return camera(self.drone.position, self.drone.angle, self.trunks, self.world, beacon)
+        return camera(self.drone.position, self.drone.angle, self._around(), self.world, beacon)
+
+    def _around(self) -> ndarray:
+        """Trunks (K, 2) that eye or laser may reach before the next look-up, every 5 m: with this
+        a step among 15,000 trunks takes hardly longer than among 150."""
+        if math.dist(self.drone.position, self.centre) > 5:
+            w, self.centre = self.world, self.drone.position
+            view = math.hypot(w.view, w.view + 2 * w.trunk_radius)  # m, to the picture's corner
+            near = 5 + max(view, w.laser_range + w.trunk_radius)  # m
+            self.around = self.trunks[np.hypot(*(self.trunks - self.centre).T) < near]  # (K, 2)
+        return self.around
 
     def _info(self) -> dict:
         pose = (*self.drone.position, self.drone.angle)

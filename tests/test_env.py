@@ -10,6 +10,7 @@ from hypothesis import given, reject
 from hypothesis import strategies as st
 
 from env import ForestEnv, World, plant, refly, reward
+from render import camera, raycast
 
 WORLD = World()
 CLEARING = replace(WORLD, rows=0)  # no trunks
@@ -92,6 +93,22 @@ def test_the_scan_starts_dead_ahead_and_goes_counter_clockwise() -> None:
     assert bearings[distance.argmin()] == pytest.approx(math.pi / 2)
     assert distance.min() == pytest.approx(4.5)
     assert distance[0] == 20.0
+
+
+def test_the_trunks_around_are_all_that_eye_and_laser_can_reach() -> None:
+    forest = dict(length=300.0, width=200.0, rows=50, columns=40, first_y=-97.0)
+    wide = World(**forest, laser_range=60.0)  # farther than the eye sees
+    env, rng = ForestEnv(wide), np.random.default_rng(0)
+    for seed in range(5):
+        env.reset(seed=seed)
+        while not env.outcome:
+            env.step(int(rng.integers(9)))
+            eye, heading = env.drone.position, env.drone.angle
+            assert np.array_equal(env.observation[-1], camera(eye, heading, env.trunks, wide))
+            bearings, seen = env.scan()
+            hit, _ = raycast(env.trunks - eye, wide.trunk_radius, bearings + heading)
+            assert np.array_equal(seen, np.minimum(hit, wide.laser_range))
+        assert len(env.around) < len(env.trunks) / 3
 
 
 def test_going_straight_makes_half_a_metre_a_step() -> None:
