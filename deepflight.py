@@ -136,15 +136,14 @@ def dynamic_window(bearings: ndarray, distances: ndarray, goal_bearing: float, w
     score = 10 * seconds until the clearance is below 0.8 m + 2 * least clearance (2 m at most)
             - 4 * heading error to the goal at the arc's end in rad
     """
-    hit = distances < world.laser_range
-    points = (distances * np.exp(1j * bearings))[hit]  # (P,) complex: x + iy in the drone's axes
+    # In the drone's axes a point is the complex number x + iy.
+    points = (distances * np.exp(1j * bearings))[distances < world.laser_range]  # (P,) m
     rates = world.yaw_rate * np.linspace(-1, 1, world.actions)  # (A,) rad/s
     headings = rates[:, None] * world.dt * np.arange(1, 16)  # (A, 15) rad
     arcs = np.cumsum(world.speed * world.dt * np.exp(1j * headings), 1)  # (A, 15) m
     clearance = np.abs(arcs[..., None] - points).min(-1, initial=world.laser_range)  # (A, 15) m
     safe = np.logical_and.accumulate(clearance >= 0.8, 1).sum(1) * world.dt  # (A,) s
-    turn = goal_bearing - headings[:, -1]  # (A,) rad
-    error = np.abs(np.angle(np.exp(1j * turn)))  # (A,) rad, wrapped
+    error = np.abs(np.angle(np.exp(1j * (goal_bearing - headings[:, -1]))))  # (A,) rad, wrapped
     return int(np.argmax(10 * safe + 2 * np.minimum(clearance.min(1), 2) - 4 * error))
 
 
@@ -211,6 +210,7 @@ class Training:
     """
 
     def __init__(self, c: Config, folder: Path) -> None:
+        torch.set_flush_denormal(True)  # else RMSProp's dead moments, below 1e-38, halve the speed
         torch.set_num_threads(c.threads)
         self.c, self.folder, self.world, self.stopped = c, folder, World(beacon=c.beacon), 0
         self.fly_rng, self.learn_rng, self.bar_rng = np.random.default_rng(c.seed).spawn(3)
@@ -443,9 +443,10 @@ def summarize(flights: Flights, bar: Flights, forests: int, rng: np.random.Gener
     Means are bootstrapped over forests, for flights through one forest are no independent draws;
     shares have Wilson's interval, which takes flights as independent: one flight a forest is.
     """
-    table, random_steps = measure(flights), per_forest(measure(bar)["steps"], forests)
+    # Flights through one forest stand as far apart as there are forests: (F,) means.
+    table, random_steps = measure(flights), measure(bar)["steps"].reshape(-1, forests).mean(0)
     draws = rng.integers(forests, size=(2000, forests))  # (2000, F) resampled forests
-    means = {key: per_forest(table[key], forests) for key in ("steps", "progress", "return")}
+    means = {k: table[k].reshape(-1, forests).mean(0) for k in ("steps", "progress", "return")}
     figures = {key: interval(x.mean(), x[draws].mean(1)) for key, x in means.items()}
     ratios = means["steps"][draws].mean(1) / random_steps[draws].mean(1)
     figures["over_random"] = interval(means["steps"].mean() / random_steps.mean() - 1, ratios - 1)
@@ -453,11 +454,6 @@ def summarize(flights: Flights, bar: Flights, forests: int, rng: np.random.Gener
     for key in ("crossed", *OUTCOMES):
         figures[key] = wilson(int(table[key].sum()), len(flights))
     return figures
-
-
-def per_forest(values: ndarray, forests: int) -> ndarray:
-    """Mean of the flights through each forest (F,), which repeat in the same order."""
-    return values.reshape(-1, forests).mean(0)
 
 
 def interval(value: float, resampled: ndarray) -> dict[str, float]:
