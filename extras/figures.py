@@ -1,7 +1,7 @@
 """Draw the paper's Figures 2, 3 and 4, and flight time against minutes, from results/.
 
-    .venv/bin/pip install -r extras/requirements.txt
-    .venv/bin/python extras/figures.py
+    extras/.venv/bin/pip install -r extras/requirements.txt
+    extras/.venv/bin/python extras/figures.py
 
 Writes figures/learning.png. Every folder of results/ with a log.csv is a training in the world its
 config.json names; those of one world and one preset are one curve, their spread a band. Not in this
