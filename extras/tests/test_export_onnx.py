@@ -1,0 +1,40 @@
+"""The exported network is the trained one: the same values and the same actions."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from deepflight import load_weights
+from dqn import greedy
+from env import World
+from extras.export_onnx import STATES, export, parity, session, states
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+def test_on_a_thousand_states_the_export_gives_torch_s_values_and_actions(tmp_path: Path) -> None:
+    q = load_weights(ROOT / "weights/paper.pt", beacon=False)
+    export(q, tmp_path / "paper.onnx")
+    report = parity(q, session(tmp_path / "paper.onnx"), states(q, World(), STATES))
+    assert report["relative error"] <= 1e-4
+    assert report["same action"] >= 0.999
+
+
+def test_parity_sees_another_network(tmp_path: Path) -> None:
+    q = load_weights(ROOT / "weights/paper.pt", beacon=False)
+    export(q, tmp_path / "paper.onnx")
+    with torch.no_grad():
+        q.head[2].bias[0] += 1
+    s = np.random.default_rng(0).integers(256, size=(3, 4, 84, 84), dtype=np.uint8)
+    assert parity(q, session(tmp_path / "paper.onnx"), s)["relative error"] > 1e-4
+
+
+def test_any_batch_will_do(tmp_path: Path) -> None:
+    q = load_weights(ROOT / "weights/paper.pt", beacon=False)
+    export(q, tmp_path / "paper.onnx")
+    run = session(tmp_path / "paper.onnx")
+    for size in (1, 7):
+        s = states(q, World(), size)
+        values = run.run(None, {"observation": s})[0]  # (size, 9)
+        assert np.array_equal(values.argmax(1), greedy(q, s))
