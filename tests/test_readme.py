@@ -30,7 +30,7 @@ def test_each_row_of_the_headline_table_is_what_eval_wrote(figure: str) -> None:
     label, factor, digits = FIGURES[figure]
     unit = " m" if figure == "progress" else " %"
     row = f"| {label} |"
-    for name, pilot in (("paper", "dqn"), ("beacon", "dqn"), ("pilots", "laser")):
+    for name, pilot in (("paper", "dqn"), ("beacon", "dqn"), ("pilots", "laser"), ("mnih", "dqn")):
         x = {
             k: f"{factor * v:.{digits}f}" for k, v in report(name)["pilots"][pilot][figure].items()
         }
@@ -39,7 +39,7 @@ def test_each_row_of_the_headline_table_is_what_eval_wrote(figure: str) -> None:
     assert row in README
 
 
-@pytest.mark.parametrize("name", ["paper", "beacon", "pilots"])
+@pytest.mark.parametrize("name", ["paper", "beacon", "pilots", "mnih"])
 def test_headline_numbers_come_from_500_forests_that_nothing_else_has_flown(name: str) -> None:
     assert report(name)["forests"] == 500
     assert report(name)["first_seed"] == 3 * 10**9
@@ -73,6 +73,17 @@ def test_the_readme_counts_how_the_headline_flights_ended() -> None:
     )
     counts += "arrived, {crash} crashed and {time} ran out of time"
     assert counts.format(**ends) in README.replace("\n", " ")
+
+
+def test_the_papers_settings_rise_and_fall_when_the_readme_says() -> None:
+    rows = list(csv.DictReader((ROOT / "results/mnih/log.csv").open()))
+    over = {int(row["step"]): float(row["test_over_random"]) for row in rows}
+    best = max(rows, key=lambda row: (float(row["test_crossed"]), float(row["test_progress"])))
+    passed = next(step for step, x in over.items() if x > 1.8)
+    fell = next(step for step, x in over.items() if step > passed and x < 0.2)
+    assert max(over) == 1_400_000 and max(x for step, x in over.items() if step > fell) < 0.2
+    for step in (passed, fell, int(best["step"])):
+        assert f"step {step:,}" in README.replace("\n", " ")
 
 
 def test_the_five_seeds_figures_are_those_of_their_logs_and_flights() -> None:
