@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -283,33 +284,35 @@ def test_an_impossible_world_is_refused_by_the_name_of_what_is_wrong(
 
 # -------------------------------------------------- whatever the world, whatever the actions
 
+# A training in this process takes subnormal numbers for nought: draw none.
+floats = partial(st.floats, allow_subnormal=False)
 WORLDS = st.builds(
     dict,
-    length=st.floats(5, 120),
-    width=st.floats(2, 60),
+    length=floats(5, 120),
+    width=floats(2, 60),
     rows=st.integers(0, 12),
     columns=st.integers(0, 8),
-    first_x=st.floats(-5, 20),
-    first_y=st.floats(-30, 5),
-    spacing_x=st.floats(0.5, 10),
-    spacing_y=st.floats(0.5, 10),
-    jitter_x=st.floats(0, 3),
-    jitter_y=st.floats(0, 3),
-    trunk_radius=st.floats(0.05, 2),
-    trunk_height=st.floats(0.1, 10),
-    altitude=st.floats(0.1, 8),
-    view=st.floats(1, 60),
-    speed=st.floats(0.1, 10),
-    yaw_rate=st.floats(0, 3),
-    goal_radius=st.floats(0.1, 5),
-    back=st.floats(0, 5),
-    dt=st.floats(0.02, 0.5),
-    d_crash=st.floats(0.1, 2),
-    d_neg=st.floats(0.5, 4),
-    laser_range=st.floats(1, 30),
-    r_safe=st.floats(-1, 1),
-    r_precrash=st.floats(-10, 0),
-    r_crash=st.floats(-20, 0),
+    first_x=floats(-5, 20),
+    first_y=floats(-30, 5),
+    spacing_x=floats(0.5, 10),
+    spacing_y=floats(0.5, 10),
+    jitter_x=floats(0, 3),
+    jitter_y=floats(0, 3),
+    trunk_radius=floats(0.05, 2),
+    trunk_height=floats(0.1, 10),
+    altitude=floats(0.1, 8),
+    view=floats(1, 60),
+    speed=floats(0.1, 10),
+    yaw_rate=floats(0, 3),
+    goal_radius=floats(0.1, 5),
+    back=floats(0, 5),
+    dt=floats(0.02, 0.5),
+    d_crash=floats(0.1, 2),
+    d_neg=floats(0.5, 4),
+    laser_range=floats(1, 30),
+    r_safe=floats(-1, 1),
+    r_precrash=floats(-10, 0),
+    r_crash=floats(-20, 0),
     max_steps=st.integers(1, 40),
     beacon=st.booleans(),
 )
