@@ -30,7 +30,7 @@ NAMES = {  # theirs -> ours
 }
 
 
-def make_model(c: Config, replay: int = REPLAY, n: int | None = None) -> DQN:
+def make_model(c: Config, replay: int = REPLAY) -> DQN:
     """Stable-Baselines3's DQN with the settings of `c` as far as it knows them."""
     envs = DummyVecEnv([lambda: Forest(beacon=c.beacon)] * c.lanes)
     return DQN(
@@ -41,7 +41,7 @@ def make_model(c: Config, replay: int = REPLAY, n: int | None = None) -> DQN:
         learning_starts=c.warmup,
         batch_size=c.batch,
         gamma=c.gamma,
-        n_steps=c.n if n is None else n,
+        n_steps=c.n,
         train_freq=1,
         gradient_steps=c.lanes // c.update_every,
         target_update_interval=c.target_every * c.update_every,
