@@ -11,6 +11,7 @@ import deepflight
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
+FLAT = README.replace("\n", " ")
 FIGURES = {  # of eval's JSON -> label in the README, factor, digits
     "over_random": ("flight time over random", 100, 0),
     "crossed": ("crossed (arrived, or left by the far edge)", 100, 1),
@@ -63,7 +64,7 @@ def test_what_the_readme_says_of_veering_is_what_was_measured() -> None:
     ):
         x = {k: f"{factor * v:.{digits}f}" for k, v in measured[name].items()}
         unit = "%" if name == "edge time" else "rad/s"
-        assert f"{x['value']} {unit} [{x['low']}, {x['high']}]" in README.replace("\n", " ")
+        assert f"{x['value']} {unit} [{x['low']}, {x['high']}]" in FLAT
 
 
 def test_the_readme_counts_how_the_headline_flights_ended() -> None:
@@ -72,7 +73,7 @@ def test_the_readme_counts_how_the_headline_flights_ended() -> None:
         "of 500 flights {far} left by the far edge, {side} by a side, {back} by the back; {goal} "
     )
     counts += "arrived, {crash} crashed and {time} ran out of time"
-    assert counts.format(**ends) in README.replace("\n", " ")
+    assert counts.format(**ends) in FLAT
 
 
 def test_the_papers_settings_rise_and_fall_when_the_readme_says() -> None:
@@ -83,7 +84,7 @@ def test_the_papers_settings_rise_and_fall_when_the_readme_says() -> None:
     fell = next(step for step, x in over.items() if step > passed and x < 0.2)
     assert max(over) == 1_400_000 and max(x for step, x in over.items() if step > fell) < 0.2
     for step in (passed, fell, int(best["step"])):
-        assert f"step {step:,}" in README.replace("\n", " ")
+        assert f"step {step:,}" in FLAT
 
 
 def test_the_five_seeds_figures_are_those_of_their_logs_and_flights() -> None:
@@ -95,4 +96,37 @@ def test_the_five_seeds_figures_are_those_of_their_logs_and_flights() -> None:
         over = report(f"seeds/{seed}")["pilots"]["dqn"]["over_random"]["value"]
         confirmed.append(f"{100 * over:+.0f}")
     for figures in (first, confirmed):
-        assert f"{', '.join(figures[:4])} and {figures[4]} %" in README.replace("\n", " ")
+        assert f"{', '.join(figures[:4])} and {figures[4]} %" in FLAT
+
+
+def test_seed_1_confirms_seed_0_as_the_readme_says() -> None:
+    for name, label in (("paper-1", "paper's world"), ("beacon-1", "with the beacon")):
+        assert (report(name)["forests"], report(name)["first_seed"]) == (500, 3 * 10**9)
+        row = f"| {label} |"
+        for key in ("over_random", "crossed", "goal", "crash"):
+            digits, sign = (0, "+") if key == "over_random" else (1, "")
+            shown = report(name)["pilots"]["dqn"][key]
+            x = {k: f"{100 * v:.{digits}f}" for k, v in shown.items()}
+            row += f" {sign}{x['value']} % [{x['low']}, {x['high']}] |"
+        assert row in README
+
+
+def test_the_readme_says_how_blind_the_papers_settings_became() -> None:
+    dead = json.loads((ROOT / "results/dead.json").read_text())["networks"]
+    best, last = dead["results/mnih/best.pt"], dead["results/mnih/last.pt"]
+    first = best["layer 1"].split()[0]
+    ours = dead["weights/paper.pt"]["layer 1"].split()[0]
+    assert f"of its first layer {first} are dead in those best weights ({ours} in ours)" in FLAT
+    assert last["layer 3"] == "64 of 64" and last["actions"] == "1 of 9"
+
+
+def test_the_clock_in_the_readme_is_the_measured_one() -> None:
+    clock = json.loads((ROOT / "results/clock.json").read_text())
+    assert f"passes +180 % after {clock['median']:.0f} s" in FLAT
+    minutes = clock["mnih, to the figure"] / 60
+    assert f"the paper's settings after some {minutes:.0f} minutes" in FLAT
+
+
+def test_each_ratio_of_the_benchmark_is_in_the_readme() -> None:
+    for name, figure in json.loads((ROOT / "results/bench.json").read_text())["figures"].items():
+        assert f"| {name} | {figure:.2f} |" in README

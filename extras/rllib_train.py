@@ -1,0 +1,146 @@
+"""Train on Ray RLlib's DQN, where one machine is not enough, and fly the result with our `eval`.
+
+    extras/.venv/bin/pip install -r extras/requirements.txt
+    extras/.venv/bin/python -m extras.rllib_train --runners 2 --steps 100000   # a Ray here
+    extras/.venv/bin/python -m extras.rllib_train --runners 64 --address auto  # join a cluster
+    extras/.venv/bin/python deepflight.py eval --weights runs/rllib.pt
+
+The network is dqn.QNetwork itself, inside RLlib's current API stack: its convolutions are the
+encoder, its head the Q-function, so the trained weights are ours as they are. Settings are those
+of deepflight.Config; RLlib has no mirroring, value of arrival, bfloat16 or late Huber delta.
+
+On a real cluster: start Ray on every machine (`ray start --head` on one, `ray start --address
+HOST:6379` on the others), with this Python and these packages installed on each; the code itself
+travels from here. Runners share the work of flying, which is cheap: one core flies thousands of
+steps a second. Learning stays in one process, with one batch of 32 every 4 steps however many
+runners there are, and is soon the limit: two runners already wait for it. What then helps is a GPU
+for the learner (`.learners(num_learners=1, num_gpus_per_learner=1)`), larger batches, or many
+seeds at once. The replay of 50,000 transitions lies in the memory of the machine that runs this.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray.rllib.algorithms.algorithm import Algorithm
+from ray.rllib.algorithms.dqn import DQNConfig
+from ray.rllib.algorithms.dqn.default_dqn_rl_module import QF_PREDS
+from ray.rllib.algorithms.dqn.torch.default_dqn_torch_rl_module import DefaultDQNTorchRLModule
+from ray.rllib.core.columns import Columns
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.utils.schedules.scheduler import Scheduler
+from ray.tune.registry import register_env
+from torch import Tensor, nn
+
+from deepflight import Config, save_weights
+from dqn import QNetwork
+from extras.gym_env import ID, Forest
+
+ROOT = Path(__file__).parent.parent
+ENVS = 4  # forests a runner flies at once
+REPLAY = 50_000  # transitions, 28 kB each
+
+
+class Nature(DefaultDQNTorchRLModule):
+    """RLlib's DQN module around our network: encoder = convolutions, af = the Q head."""
+
+    def setup(self) -> None:
+        """Build the network, in place of the one that RLlib's catalog would."""
+        self.uses_dueling, self.uses_double_q, self.num_atoms = False, Config.double, 1
+        self.epsilon_schedule = Scheduler(self.model_config["epsilon"], framework="torch")
+        q = QNetwork(self.action_space.n)
+        self.encoder, self.af = q.conv, q.head
+
+    def _qf_forward_helper(
+        self, batch: dict[str, Tensor], encoder: nn.Module, head: nn.Module
+    ) -> dict[str, Tensor]:
+        return {QF_PREDS: head(encoder(batch[Columns.OBS].float() / 255))}  # (B, actions)
+
+
+def make_config(c: Config, runners: int) -> DQNConfig:
+    """RLlib's DQN with the settings of `c` as far as it knows them."""
+    replay = {"type": "EpisodeReplayBuffer", "capacity": REPLAY}
+    epsilon = [[0, c.epsilon_start], [c.epsilon_decay, c.epsilon_final]]
+    # RLlib counts one runner too many when it works out how often to learn.
+    intensity = c.batch / c.update_every * runners / (runners + 1)
+    return (
+        DQNConfig()
+        .environment(ID)
+        .env_runners(
+            num_env_runners=runners, num_envs_per_env_runner=ENVS, rollout_fragment_length=c.n
+        )
+        .rl_module(rl_module_spec=RLModuleSpec(module_class=Nature))
+        .training(
+            lr=[[0, c.lr], [c.steps, c.lr_final]],
+            gamma=c.gamma,
+            n_step=c.n,
+            double_q=c.double,
+            dueling=False,
+            num_atoms=1,
+            epsilon=epsilon,
+            train_batch_size_per_learner=c.batch,
+            training_intensity=intensity,
+            num_steps_sampled_before_learning_starts=c.warmup,
+            target_network_update_freq=c.target_every * c.update_every,
+            td_error_loss_fn="huber",
+            adam_epsilon=c.optimizer_eps,
+            grad_clip=c.max_grad_norm,
+            grad_clip_by="global_norm",
+            replay_buffer_config=replay,
+        )
+        .debugging(seed=c.seed)
+    )
+
+
+def network(algorithm: Algorithm) -> QNetwork:
+    """The network as it is now."""
+    module: Any = algorithm.get_module()
+    q = QNetwork(module.action_space.n)
+    q.conv.load_state_dict(module.encoder.state_dict())
+    q.head.load_state_dict(module.af.state_dict())
+    return q
+
+
+def train(c: Config, runners: int, out: Path) -> None:
+    """Train for c.steps, with a line each thousand steps or so, and write the weights."""
+    register_env(ID, lambda _context: Forest())
+    algorithm, steps = make_config(c, runners).build_algo(), 0
+    while steps < c.steps:
+        result = algorithm.train()
+        flown, seconds = result["env_runners"], result["time_total_s"]
+        steps = int(flown["num_env_steps_sampled_lifetime"])
+        length = flown.get("episode_len_mean", float("nan"))
+        left = (c.steps - steps) * seconds / steps / 60
+        print(f"{steps:9,} steps, {steps / seconds:5.0f} a second, {left:5.1f} min left, ", end="")
+        print(f"flights of {length:.1f} steps", flush=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_weights(out, network(algorithm), c.beacon)
+    algorithm.stop()
+    print(f"wrote {out}; fly it: python deepflight.py eval --weights {out}")
+
+
+def start(address: str | None) -> None:
+    """Join the Ray at this address, or start one here; every runner gets the code."""
+    code = {"working_dir": str(ROOT), "excludes": [".venv", "runs", "results", "figures"]}
+    ray.init(address=address, runtime_env=code, include_dashboard=False, log_to_driver=False)
+
+
+def main() -> None:
+    """Join or start a Ray, train, and stop it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runners", type=int, default=2, help="processes that fly")
+    parser.add_argument("--steps", type=int, default=Config.steps, help="control steps in all")
+    parser.add_argument("--address", help="of a running Ray; else one is started here")
+    parser.add_argument("--out", type=Path, default="runs/rllib.pt", help="the weights' file")
+    args = parser.parse_args()
+    c = Config(steps=args.steps)
+    start(args.address)
+    try:
+        train(c, args.runners, args.out)
+    finally:
+        ray.shutdown()
+
+
+if __name__ == "__main__":
+    main()
