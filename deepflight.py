@@ -501,8 +501,7 @@ def draw_pictures(flights: dict[str, Flights], seeds: range, world: World, out: 
 def track(flight: dict, world: World) -> tuple[ndarray, str]:
     """Where a flight went (T + 1, 2) in m, by flying it again, and its edge or outcome."""
     steps = refly(flight["seed"], flight["actions"], world, camera=False)
-    path = np.array([info["pose"][:2] for *_, info in steps])
-    return path, flight["edge"] or flight["outcome"]
+    return np.array([info["pose"][:2] for *_, info in steps]), flight["edge"] or flight["outcome"]
 
 
 # -------------------------------------------------- command line

@@ -68,8 +68,7 @@ class QNetwork(nn.Module):
         float32: between 64 and 128 bfloat16 moves in steps of 0.5 and the actions would tie.
         """
         with torch.autocast(s.device.type, torch.bfloat16, enabled=bfloat16):
-            # Channels last in memory: a fifth off the time of an update in float32.
-            seen = self.conv(s.float(memory_format=torch.channels_last) / 255)  # (B, 3136)
+            seen = self.conv(s.float() / 255)  # (B, 3136)
         return self.head(seen.float())  # (B, actions)
 
 
@@ -199,10 +198,12 @@ class DQN(nn.Module):
     def __init__(self, settings: Any, actions: int, seed: int) -> None:
         super().__init__()
         self.settings, self.actions, self.updates = settings, actions, 0
+        # Channels last in memory: less time for float32, the same for bfloat16.
+        layout = {"float32": torch.channels_last}.get(settings.precision, torch.contiguous_format)
         with torch.random.fork_rng():  # torch draws initial weights from its global generator:
             torch.manual_seed(seed % 2**64)  # lend it our seed and put its own state back
-            self.q = QNetwork(actions).to(settings.device)  # line 2
-            self.q_target = QNetwork(actions).to(settings.device)
+            self.q = QNetwork(actions).to(settings.device, memory_format=layout)  # line 2
+            self.q_target = QNetwork(actions).to(settings.device, memory_format=layout)
         self.q_target.load_state_dict(self.q.state_dict())  # line 3
         self.optimizer = make_optimizer(self.q, settings)
         self.worth = {DEAD: 0.0, GOAL: settings.goal_value, FAR: settings.far_value}
