@@ -20,7 +20,7 @@ results/bench.json and prints the README's table. The runners are in peers.py.
 
 import json
 import os
-import platform
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -46,13 +46,13 @@ from extras.peers import (
 )
 from extras.sb3_train import make_model
 
-ROOT, ROUNDS, SECONDS = Path(__file__).parent.parent, 5, 3.0
+ROOT, ROUNDS, SECONDS = Path(__file__).parent.parent, 5, 4.0
 LONG = {"length": 900.0, "rows": 150}
 WIDE = LONG | {"width": 500.0, "columns": 100, "first_y": -247.0}
 FORESTS = {150: {}, 1_500: LONG, 15_000: WIDE}  # trunks -> the world
 BATCHES = (32, 128, 512)
 # Multiplications for one state, layer by layer, in five passes: forward Q(s), Q(s2) and Q^(s2), and
-# backward to the weights and to what came in, which for the first layer is nobody's business
+# backward to the weights and to what came in, which for the first layer is not needed
 FLOOR = 4 * 400 * 32 * 256 + 5 * (81 * 64 * 512 + 49 * 64 * 576 + 3136 * 512 + 512 * 9)
 SCENES = {  # of the peers, the emptiest first
     "ViZDoom, my_way_home": doom("my_way_home"),
@@ -114,6 +114,7 @@ def replay_bytes() -> dict[str, float]:
 def main() -> None:
     """Run it all, write it, print it."""
     torch.set_num_threads(Config.threads)
+    torch.set_flush_denormal(True)  # as our training does, for Stable-Baselines3 too
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})  # a game started from here inherits the one core
     a = turns(rate, {"forest": forest(), **SCENES})
@@ -124,20 +125,22 @@ def main() -> None:
     b = turns(rate, {"sb3": sb3(), **ours})
     e = turns(rate, {str(n): updates(n) for n in BATCHES} | {"products": products()})
     c, default = replay_bytes(), f"ours {PRECISION}"
-    figures = {f"environment, over {scene}": ratio(a, "forest", scene) for scene in SCENES}
+    figures = {f"environment steps a second: ours / {x}": ratio(a, "forest", x) for x in SCENES}
+    train, step = "training steps a second: ours", "time of a step:"
     figures |= {
-        "training, over Stable-Baselines3, float32": ratio(b, "ours float32", "sb3"),
-        f"training, over Stable-Baselines3, {PRECISION}": ratio(b, default, "sb3"),
-        "replay, Stable-Baselines3's bytes over ours": c["sb3"] / c["ours"],
-        "a step among 1,500 trunks, over 150": ratio(d, "150 trunks", "1500 trunks"),
-        "a step among 15,000 trunks, over 150": ratio(d, "150 trunks", "15000 trunks"),
+        f"{train} / Stable-Baselines3's, float32 both": ratio(b, "ours float32", "sb3"),
+        f"{train} in {PRECISION} / Stable-Baselines3's": ratio(b, default, "sb3"),
+        "replay bytes a transition: Stable-Baselines3's default / ours": c["sb3"] / c["ours"],
+        f"{step} 1,500 / 150 trunks": ratio(d, "150 trunks", "1500 trunks"),
+        f"{step} 15,000 / 150 trunks": ratio(d, "150 trunks", "15000 trunks"),
     }
     for n in BATCHES:
         floors = [r * FLOOR * n / m for r, m in zip(e[str(n)], e["products"], strict=True)]
-        figures[f"an update of batch {n}, its floor's share"] = median(floors)
+        figures[f"time of an update of {n}: multiplications alone / measured"] = median(floors)
     rates = {name: median(x) for part in (a, b, d, e) for name, x in part.items()}
-    report = {"machine": platform.processor() or platform.machine(), "threads": Config.threads}
-    report |= {"torch": torch.__version__, "figures": figures, "rates": rates, "bytes": c}
+    cpu = re.search("model name.*: (.*)", Path("/proc/cpuinfo").read_text())[1]
+    report = {"machine": cpu, "torch": torch.__version__, "threads": Config.threads}
+    report |= {"figures": figures, "rates": rates, "bytes": c}
     (ROOT / "results/bench.json").write_text(json.dumps(report, indent=1) + "\n")
     print("\n".join(f"| {name} | {figure:.2f} |" for name, figure in figures.items()))
 

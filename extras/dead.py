@@ -2,10 +2,10 @@
 
     .venv/bin/python extras/dead.py
 
-A rectifier that gives nought on every input passes no gradient back, so its filter never changes
-again: it is dead. The laser pilot flies the first ten evaluation forests; a filter counts as dead
-if it gives nought everywhere on all the frames met there, and so does a unit of the 512. A network
-with a whole layer dead is blind: the last column says how many of the nine actions it chooses
+A rectifier that outputs zero passes no gradient back; one that always does is dead, as long as what
+comes in does not change. The laser pilot flies the first ten evaluation forests; a filter counts as
+dead if it outputs zero everywhere on all the frames met there, and so does a unit of the 512. A
+network with a whole layer dead is blind: the last column says how many of nine actions it chooses
 at all. The networks are those of the paper's settings, at their best and at the end of their 1.4
 million steps, and the shipped one. Writes results/dead.json.
 """

@@ -10,11 +10,11 @@ Not in this file: clocks, ratios, what the numbers mean.
 
 import os
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import gymnasium
-import miniworld  # noqa: F401  registers its environments
 import numpy as np
 import torch
 import vizdoom
@@ -46,19 +46,22 @@ def doom(scenario: str) -> Iterator[int]:
     game.set_screen_format(vizdoom.ScreenFormat.GRAY8)
     game.set_window_visible(False)
     buttons = np.eye(game.get_available_buttons_size()).tolist()
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder, closing(game):
         game.set_doom_config_path(f"{folder}/vizdoom.ini")  # else it is left lying here
         game.init()
         while True:
             game.new_episode()
             while not game.is_episode_finished():
-                assert game.get_state().screen_buffer.shape == (120, 160)
+                frame = game.get_state().screen_buffer  # (120, 160)
+                assert frame.shape == (120, 160)
                 game.make_action(buttons[RNG.integers(len(buttons))])
                 yield 1
 
 
 def rooms(scene: str) -> Iterator[int]:
     """MiniWorld, 84x84 in colour, as it always is."""
+    import miniworld  # noqa: F401, not before the benchmark has chosen the core: it starts threads
+
     env = gymnasium.make(f"MiniWorld-{scene}-v0", obs_width=84, obs_height=84)
     while True:
         env.reset()

@@ -1,4 +1,4 @@
-"""Train on Ray RLlib's DQN, where one machine is not enough, and fly the result with our `eval`.
+"""Train on Ray RLlib's DQN, where one machine is not enough, and fly the result in our `eval`.
 
     extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.rllib_train --runners 2 --steps 100000   # a Ray here
@@ -9,13 +9,13 @@ The network is dqn.QNetwork itself, inside RLlib's current API stack: its convol
 encoder, its head the Q-function, so the trained weights are ours as they are. Settings are those
 of deepflight.Config; RLlib has no mirroring, value of arrival, bfloat16 or late Huber delta.
 
-On a real cluster: start Ray on every machine (`ray start --head` on one, `ray start --address
-HOST:6379` on the others), with this Python and these packages installed on each; the code itself
-travels from here. Runners share the work of flying, which is cheap: one core flies thousands of
-steps a second. Learning stays in one process, with one batch of 32 every 4 steps however many
-runners there are, and is soon the limit: two runners already wait for it. What then helps is a GPU
-for the learner (`.learners(num_learners=1, num_gpus_per_learner=1)`), larger batches, or many
-seeds at once. The replay of 50,000 transitions lies in the memory of the machine that runs this.
+On a real cluster, which we have not tried: start Ray on every machine (`ray start --head` on one,
+`ray start --address HOST:6379` on the others), with this Python and these packages on each; the
+code travels from here. Runners share the flying, which is cheap. Learning stays in one process, a
+batch of 32 every 4 steps however many runners there are, and is the limit at once: two runners on
+two cores flew 790 steps a second while nothing learned and 80 once it did. What helps then is a GPU
+for the learner (`.learners(num_learners=1, num_gpus_per_learner=1)`), larger batches, or many seeds
+at once. The replay of 50,000 transitions lies in this machine's memory; Ray logs to ~/ray_results.
 """
 
 import argparse
@@ -104,26 +104,27 @@ def network(algorithm: Algorithm) -> QNetwork:
 
 def train(c: Config, runners: int, out: Path) -> None:
     """Train for c.steps, with a line each thousand steps or so, and write the weights."""
-    register_env(ID, lambda _context: Forest())
+    register_env(ID, lambda _context: Forest(beacon=c.beacon))
     algorithm, steps = make_config(c, runners).build_algo(), 0
     while steps < c.steps:
         result = algorithm.train()
         flown, seconds = result["env_runners"], result["time_total_s"]
         steps = int(flown["num_env_steps_sampled_lifetime"])
-        length = flown.get("episode_len_mean", float("nan"))
         left = (c.steps - steps) * seconds / steps / 60
-        print(f"{steps:9,} steps, {steps / seconds:5.0f} a second, {left:5.1f} min left, ", end="")
-        print(f"flights of {length:.1f} steps", flush=True)
+        text = f"{steps:9,} steps, {steps / seconds:5.0f} a second, {left:5.1f} min left"
+        print(f"{text}, flights of {flown.get('episode_len_mean', 0):.1f} steps", flush=True)
     out.parent.mkdir(parents=True, exist_ok=True)
     save_weights(out, network(algorithm), c.beacon)
     algorithm.stop()
-    print(f"wrote {out}; fly it: python deepflight.py eval --weights {out}")
+    print(f"wrote {out}; fly it: deepflight.py eval{' --beacon' * c.beacon} --weights {out}")
 
 
 def start(address: str | None) -> None:
     """Join the Ray at this address, or start one here; every runner gets the code."""
     code = {"working_dir": str(ROOT), "excludes": [".venv", "runs", "results", "figures"]}
-    ray.init(address=address, runtime_env=code, include_dashboard=False, log_to_driver=False)
+    ray.init(
+        address=address or "local", runtime_env=code, include_dashboard=False, log_to_driver=False
+    )
 
 
 def main() -> None:
@@ -131,13 +132,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runners", type=int, default=2, help="processes that fly")
     parser.add_argument("--steps", type=int, default=Config.steps, help="control steps in all")
+    parser.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
     parser.add_argument("--address", help="of a running Ray; else one is started here")
     parser.add_argument("--out", type=Path, default="runs/rllib.pt", help="the weights' file")
     args = parser.parse_args()
-    c = Config(steps=args.steps)
+    if args.runners < 1:
+        parser.error(f"runners is {args.runners}, allowed: 1 or more")
     start(args.address)
     try:
-        train(c, args.runners, args.out)
+        train(Config(steps=args.steps, beacon=args.beacon), args.runners, args.out)
     finally:
         ray.shutdown()
 

@@ -88,15 +88,13 @@ def test_the_papers_settings_rise_and_fall_when_the_readme_says() -> None:
 
 
 def test_the_five_seeds_figures_are_those_of_their_logs_and_flights() -> None:
-    first, confirmed = [], []
+    over = [report(f"seeds/{seed}")["pilots"]["dqn"]["over_random"]["value"] for seed in range(5)]
+    figures = [f"{100 * x:+.0f}" for x in over]
+    assert f"{', '.join(figures[:4])} and {figures[4]} %" in FLAT
     for seed in range(5):
         rows = list(csv.DictReader((ROOT / f"results/seeds/{seed}.csv").open()))
-        early = [float(row["test_over_random"]) for row in rows if int(row["step"]) <= 25_000]
-        first.append(f"{100 * next(x for x in early if x > 1.8):+.0f}")
-        over = report(f"seeds/{seed}")["pilots"]["dqn"]["over_random"]["value"]
-        confirmed.append(f"{100 * over:+.0f}")
-    for figures in (first, confirmed):
-        assert f"{', '.join(figures[:4])} and {figures[4]} %" in FLAT
+        passed = (int(row["step"]) for row in rows if float(row["test_over_random"]) > 1.8)
+        assert next(passed) in (10_000, 15_000)
 
 
 def test_seed_1_confirms_seed_0_as_the_readme_says() -> None:
@@ -114,10 +112,13 @@ def test_seed_1_confirms_seed_0_as_the_readme_says() -> None:
 def test_the_readme_says_how_blind_the_papers_settings_became() -> None:
     dead = json.loads((ROOT / "results/dead.json").read_text())["networks"]
     best, last = dead["results/mnih/best.pt"], dead["results/mnih/last.pt"]
-    first = best["layer 1"].split()[0]
-    ours = dead["weights/paper.pt"]["layer 1"].split()[0]
-    assert f"of its first layer {first} are dead in those best weights ({ours} in ours)" in FLAT
+    first, ours = (x["layer 1"].split()[0] for x in (best, dead["weights/paper.pt"]))
+    assert f"In the first layer {first} of 32 did already" in FLAT
+    assert f"and {ours} of 32 do in ours" in FLAT
     assert last["layer 3"] == "64 of 64" and last["actions"] == "1 of 9"
+    rows = list(csv.DictReader((ROOT / "results/mnih/log.csv").open()))
+    late = [row["test_steps"] for row in rows if int(row["step"]) >= 760_000]
+    assert (len(late), len(set(late))) == (33, 9)
 
 
 def test_the_clock_in_the_readme_is_the_measured_one() -> None:
