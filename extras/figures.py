@@ -4,8 +4,8 @@
     extras/.venv/bin/python extras/figures.py
 
 Writes figures/learning.png. Every folder of results/ with a log.csv is a training in the world its
-config.json names; those of one world and one preset are one curve, their spread a band. Not in this
-file: flights.png and flight.gif, which `deepflight.py eval` draws.
+config.json names; those of one world, preset and length are one curve, their spread a band. Not in
+this file: flights.png and flight.gif, which `deepflight.py eval` draws.
 """
 
 import csv
@@ -40,7 +40,8 @@ def trainings() -> dict[str, list[dict[str, np.ndarray]]]:
     groups = defaultdict(list)
     for folder in sorted(path.parent for path in (ROOT / "results").glob("*/log.csv")):
         config = json.loads((folder / "config.json").read_text())
-        recipe = "the paper's settings" if config["preset"] == "mnih" else "our recipe"
+        ours = f"our recipe, {config['steps']:,} steps"
+        recipe = "the paper's settings" if config["preset"] == "mnih" else ours
         log = read(folder / "log.csv")
         minutes = read(folder / "timing.csv")["seconds"] / 60  # (T,)
         groups[recipe + (", beacon" if config["beacon"] else "")].append(log | {"minutes": minutes})
