@@ -1,15 +1,16 @@
-"""Draw the paper's Figures 2, 3 and 4, and flight time against minutes, from results/.
+"""Draw every picture of the README from results/, the paper's Figures 2, 3 and 4 among them.
 
     extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python extras/figures.py
 
-Writes figures/learning.png. Every folder of results/ with a log.csv is a training in the world its
-config.json names; those of one world, preset and length are one curve, their spread a band. Not in
-this file: flights.png and flight.gif, which `deepflight.py eval` draws.
+figures/learning.png: every folder of results/ with a log.csv is a training in the world its
+config.json names; those of one world, preset and length are one curve, their spread a band.
+figures/flights.png and flight.gif: the flights of results/eval.json, flown again.
 """
 
 import csv
 import json
+import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -20,6 +21,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+from deepflight import draw_pictures  # noqa: E402
+from env import World  # noqa: E402
+
 PAPER = 1.8  # the paper's figure: 180 % more flight time than random [DF, abstract]
 PANELS = {  # column of log.csv -> title
     "train_return": "Figure 2: return in training, mean of 100 flights",
@@ -69,7 +74,7 @@ def levels(axes: plt.Axes, y: str, logs: list[dict]) -> None:
     axes.axhline(bar, color="black", linestyle=":", label="random pilot")
 
 
-def main() -> None:
+def draw_learning() -> None:
     """Four panels, one picture."""
     groups = trainings()
     figure, panels = plt.subplots(2, 2, figsize=(12, 8), layout="constrained")
@@ -88,6 +93,15 @@ def main() -> None:
     panels[1, 0].legend(fontsize=8)
     figure.savefig(ROOT / "figures/learning.png", dpi=100)
     print("wrote figures/learning.png")
+
+
+def main() -> None:
+    """The curves, then the flights."""
+    draw_learning()
+    report = json.loads((ROOT / "results/eval.json").read_text())
+    seeds = range(report["first_seed"], report["first_seed"] + report["forests"])
+    flights = {name: pilot["flights"] for name, pilot in report["pilots"].items()}
+    draw_pictures(flights, seeds, World(beacon=report["beacon"]), ROOT / "figures")
 
 
 if __name__ == "__main__":
