@@ -41,7 +41,7 @@ def test_each_row_of_the_headline_table_is_what_eval_wrote(figure: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["paper", "beacon", "pilots", "mnih"])
-def test_headline_numbers_come_from_500_forests_that_nothing_else_has_flown(name: str) -> None:
+def test_headline_numbers_come_from_500_forests_that_no_training_has_seen(name: str) -> None:
     assert report(name)["forests"] == 500
     assert report(name)["first_seed"] == 3 * 10**9
 
