@@ -74,8 +74,8 @@ def raycast(trunks: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray,
     if not len(trunks):
         return np.full(len(bearings), np.inf), np.zeros(len(bearings))
     cos, sin = np.cos(bearings), np.sin(bearings)
-    along = trunks @ np.stack([cos, sin])  # (N, M) how far the ray flies until it passes the centre
-    across = trunks @ np.stack([-sin, cos])  # (N, M) and by how much it passes it
+    # How far a ray flies until it passes a centre, and by how much it passes it: (N, M) each.
+    along, across = trunks @ np.array([[cos, sin], [-sin, cos]])
     with np.errstate(invalid="ignore"):
         half_chord = np.sqrt(radius**2 - across**2)  # (N, M) nan: the ray misses
     distance = along - half_chord  # (N, M) negative: the trunk is behind
