@@ -336,6 +336,7 @@ def train(run: Training) -> int:
     Returns the exit code: 0, or 128 and the signal that interrupted it.
     """
     c = run.c
+    write_whole(run.folder / "config.json", json.dumps(vars(c), indent=2).encode())
     if "bar" not in run.book:  # mean flight time of the random pilot, in steps
         bar = fly_random(run.test_seeds, run.world, run.bar_rng)
         run.book["bar"] = float(measure(bar)["steps"].mean())
@@ -559,21 +560,21 @@ def prepare_train(args: argparse.Namespace) -> Callable[[], int]:
         raise ValueError(f"name is {args.name!r}, allowed is that of a new folder in runs/")
     run = Training(c, folder)  # before the folder is made, for memory may not suffice
     folder.mkdir(parents=True)
-    text = json.dumps({"preset": args.preset} | vars(c), indent=2)
-    write_whole(folder / "config.json", text.encode())
     run.lock = lock_folder(folder)
     run.begin()
     return lambda: train(run)
 
 
 def agreed(saved: dict, given: dict[str, Any], folder: Path) -> Config:
-    """The settings of a checkpoint, if nothing that is given now contradicts them."""
+    """The settings of a checkpoint, if nothing that is given now contradicts them; only the number
+    of steps may change, and the learning rate then falls to that."""
     c, was = Config(**saved["config"] | given), saved["config"]
-    differ = ", ".join(f"{k} {x}, was {was.get(k)}" for k, x in vars(c).items() if x != was.get(k))
+    other = [k for k, x in vars(c).items() if x != was.get(k) and k != "steps"]
+    differ = ", ".join(f"{k} {getattr(c, k)}, was {was.get(k)}" for k in other)
     if differ:
         raise ValueError(f"{folder} has other settings: {differ}; leave them out or begin anew")
     if saved["book"]["step"] >= c.steps:
-        raise ValueError(f"{folder} has flown all of its {c.steps:,} steps")
+        raise ValueError(f"{folder} has flown all of its {c.steps:,} steps: give more by --steps")
     return c
 
 

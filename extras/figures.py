@@ -4,7 +4,7 @@
     extras/.venv/bin/python extras/figures.py
 
 figures/learning.png: every folder of results/ with a log.csv is a training in the world its
-config.json names; those of one world, preset and length are one curve, their spread a band.
+config.json names; those of one world, optimizer and length are one curve, their spread a band.
 figures/flights.png and flight.gif: the flights of results/eval.json, flown again.
 """
 
@@ -46,7 +46,7 @@ def trainings() -> dict[str, list[dict[str, np.ndarray]]]:
     for folder in sorted(path.parent for path in (ROOT / "results").glob("*/log.csv")):
         config = json.loads((folder / "config.json").read_text())
         ours = f"our recipe, {config['steps']:,} steps"
-        recipe = "the paper's settings" if config["preset"] == "mnih" else ours
+        recipe = "the paper's settings" if config["optimizer"] == "rmsprop" else ours
         log = read(folder / "log.csv")
         minutes = read(folder / "timing.csv")["seconds"] / 60  # (T,)
         groups[recipe + (", beacon" if config["beacon"] else "")].append(log | {"minutes": minutes})

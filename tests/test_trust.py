@@ -5,10 +5,12 @@ moments, runs by `python -m pytest -m long`.
 """
 
 import hashlib
+import json
 import os
 import pickle
 import resource
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -193,6 +195,19 @@ def test_a_second_ctrl_c_stops_at_once_and_the_checkpoint_stays_whole(tmp_path: 
     assert process.returncode == 130
     assert error == "\ninterrupted\n"
     assert load(tmp_path / "runs/small" / CHECKPOINT, "checkpoint")["book"]["step"] == 0
+
+
+def test_a_finished_training_goes_on_when_it_is_given_more_steps(
+    uninterrupted: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "runs/small"
+    shutil.copytree(uninterrupted, run)
+    code, _, error = finish("train", "--resume", "runs/small", "--steps", "960", folder=tmp_path)
+    assert code == 0, error
+    before, after = ((f / "log.csv").read_text() for f in (uninterrupted, run))
+    assert after.startswith(before)
+    assert after.splitlines()[-1].startswith("960,")
+    assert json.loads((run / "config.json").read_text())["steps"] == 960
 
 
 # -------------------------------------------------- nothing broken is believed
