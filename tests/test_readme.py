@@ -135,3 +135,16 @@ def test_the_clock_in_the_readme_is_the_measured_one() -> None:
 def test_each_ratio_of_the_benchmark_is_in_the_readme() -> None:
     for name, figure in json.loads((ROOT / "results/bench.json").read_text())["figures"].items():
         assert f"| {name} | {figure:.2f} |" in README
+
+
+def test_what_the_readme_says_of_the_compass_is_what_was_measured() -> None:
+    x = json.loads((ROOT / "results/compass.json").read_text())
+    for said in (
+        f"to {x['rows in the middle, degrees off']:.0f} degrees (chance is 45)",
+        f"it faces ({x['heading in the middle, degrees off']:.0f}; chance is 90)",
+        f"for a side in {x['the far edge taken for side, %']:.0f} % of cases",
+        f"for the far edge in {x['the far edge taken for far, %']:.0f} %",
+        f"crosses {x['the laser pilot, straight on: crossed, %']:.1f} % of 500 forests",
+        f"and {x['the laser pilot, by compass: crossed, %']:.1f} % with a compass",
+    ):
+        assert said in FLAT
