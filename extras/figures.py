@@ -5,7 +5,8 @@
 
 figures/learning.png: every folder of results/ with a log.csv is a training in the world its
 config.json names; those of one world, optimizer and length are one curve, their spread a band.
-figures/flights.png and flight.gif: the flights of results/eval.json, flown again.
+figures/crossed.png: what crossed in the paper's world, beside the laser pilot with and without a
+compass. figures/flights.png and flight.gif: the flights of results/eval.json, flown again.
 """
 
 import csv
@@ -26,6 +27,11 @@ from deepflight import draw_pictures  # noqa: E402
 from env import World  # noqa: E402
 
 PAPER = 1.8  # the paper's figure: 180 % more flight time than random [DF, abstract]
+CROSSED = {  # log in results/ -> label
+    "paper/log.csv": "recipe, seed 0",
+    "paper-1/log.csv": "recipe, seed 1",
+    "tried/far-and-dead.csv": "an update in 16 steps, ends worth +200 and -100",
+}
 PANELS = {  # column of log.csv -> title
     "train_return": "Figure 2: return in training, mean of 100 flights",
     "test_return": "Figure 3: return on the test forests",
@@ -45,7 +51,8 @@ def trainings() -> dict[str, list[dict[str, np.ndarray]]]:
     groups = defaultdict(list)
     for folder in sorted(path.parent for path in (ROOT / "results").glob("*/log.csv")):
         config = json.loads((folder / "config.json").read_text())
-        ours = f"our recipe, {config['steps']:,} steps"
+        every = "" if config["update_every"] == 4 else f", an update in {config['update_every']}"
+        ours = f"our recipe, {config['steps']:,} steps{every}"
         recipe = "the paper's settings" if config["optimizer"] == "rmsprop" else ours
         log = read(folder / "log.csv")
         minutes = read(folder / "timing.csv")["seconds"] / 60  # (T,)
@@ -95,9 +102,28 @@ def draw_learning() -> None:
     print("wrote figures/learning.png")
 
 
+def draw_crossed() -> None:
+    """The share of test flights that cross, a mean over five test points."""
+    figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
+    for name, label in CROSSED.items():
+        log = read(ROOT / "results" / name)
+        share = np.convolve(100 * log["test_crossed"], np.ones(5) / 5, "valid")  # (T - 4,) %
+        axes.plot(log["step"][4:], share, label=label, linewidth=1.2)
+    laser = json.loads((ROOT / "results/compass.json").read_text())
+    for way, line in (("straight on", ":"), ("by compass", "--")):
+        y = laser[f"the laser pilot, {way}: crossed, %"]
+        axes.axhline(y, color="black", linestyle=line, label=f"laser pilot, {way}")
+    axes.set(title="Crossed in the paper's world, %", xlabel="control steps", ylim=(0, 100))
+    axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
+    figure.savefig(ROOT / "figures/crossed.png", dpi=100)
+    print("wrote figures/crossed.png")
+
+
 def main() -> None:
     """The curves, then the flights."""
     draw_learning()
+    draw_crossed()
     report = json.loads((ROOT / "results/eval.json").read_text())
     seeds = range(report["first_seed"], report["first_seed"] + report["forests"])
     flights = {name: pilot["flights"] for name, pilot in report["pilots"].items()}

@@ -5,9 +5,11 @@ import json
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import deepflight
+from extras import ablate
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -40,9 +42,13 @@ def test_each_row_of_the_headline_table_is_what_eval_wrote(figure: str) -> None:
     assert row in README
 
 
-@pytest.mark.parametrize("name", ["paper", "beacon", "pilots", "mnih"])
-def test_headline_numbers_come_from_500_forests_that_no_training_has_seen(name: str) -> None:
-    assert report(name)["forests"] == 500
+@pytest.mark.parametrize(
+    ("name", "forests"), [("paper", 1000), ("beacon", 1000), ("pilots", 1000), ("mnih", 500)]
+)
+def test_headline_numbers_come_from_forests_that_no_training_has_seen(
+    name: str, forests: int
+) -> None:
+    assert report(name)["forests"] == forests
     assert report(name)["first_seed"] == 3 * 10**9
 
 
@@ -70,7 +76,7 @@ def test_what_the_readme_says_of_veering_is_what_was_measured() -> None:
 def test_the_readme_counts_how_the_headline_flights_ended() -> None:
     ends = Counter(f["edge"] or f["outcome"] for f in report("paper")["pilots"]["dqn"]["flights"])
     counts = (
-        "of 500 flights {far} left by the far edge, {side} by a side, {back} by the back; {goal} "
+        "of 1,000 flights {far} left by the far edge, {side} by a side, {back} by the back; {goal} "
     )
     counts += "arrived, {crash} crashed and {time} ran out of time"
     assert counts.format(**ends) in FLAT
@@ -148,3 +154,32 @@ def test_what_the_readme_says_of_the_compass_is_what_was_measured() -> None:
         f"and {x['the laser pilot, by compass: crossed, %']:.1f} % with a compass",
     ):
         assert said in FLAT
+
+
+def test_the_beacon_pilot_and_the_laser_are_compared_forest_by_forest() -> None:
+    camera, laser = (
+        np.array([f["outcome"] == "goal" for f in report(name)["pilots"][pilot]["flights"]])
+        for name, pilot in (("beacon", "dqn"), ("pilots", "laser"))
+    )
+    difference = 100 * (camera.astype(float) - laser)  # (F,) points
+    mean, half = difference.mean(), 1.96 * difference.std() / np.sqrt(len(difference))
+    said = f"arrives in {-mean:.1f} [{-mean - half:.1f}, {-mean + half:.1f}] percentage points"
+    assert f"{said} fewer of them" in FLAT
+
+
+def test_the_table_of_ablations_is_that_of_their_logs() -> None:
+    for row in ablate.table():
+        assert row in README
+
+
+def test_the_atlas_says_what_the_readme_says() -> None:
+    atlas = json.loads((ROOT / "results/atlas.json").read_text())
+    dense, speed = atlas["densities"].index(2.0), atlas["speeds"].index(5.0)
+    camera, laser = (100 * atlas["crossed"][x][dense][speed] for x in ("camera, beacon", "laser"))
+    assert f"crosses {camera:.0f} % at 5 m/s, the laser {laser:.0f} %" in FLAT
+    crashes = [flight for flight in atlas["worst"] if flight["outcome"] == "crash"]
+    assert len(crashes) < len(atlas["worst"])  # so these are all of the crashes
+    assert f"it crashed in {len(crashes)}, all of them in the last 13 m" in FLAT
+    assert min(flight["progress"] for flight in crashes) > 90 - 13
+    assert {flight["cause"] for flight in crashes} == {"careless"}
+    assert f"--first-seed {atlas['worst'][0]['seed']}" in FLAT
