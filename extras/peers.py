@@ -24,7 +24,8 @@ from env import ForestEnv
 from extras.sb3_train import make_model
 
 REPLAY = 20_000  # transitions: Stable-Baselines3's take 1.1 GB
-PLAIN = dict(n=1, double=False, mirror=False, replay=REPLAY, warmup=400)  # 1-step DQN
+# 1-step DQN, past exploration
+PLAIN = dict(n=1, double=False, mirror=False, replay=REPLAY, warmup=400, epsilon_start=0.05)
 RNG = np.random.default_rng(0)
 
 
