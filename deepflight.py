@@ -544,14 +544,15 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def prepare_train(args: argparse.Namespace) -> Callable[[], int]:
     """Check everything and make or reopen the run's folder."""
     given = {f.name: getattr(args, f.name) for f in fields(Config) if hasattr(args, f.name)}
-    given = (MNIH if args.preset == "mnih" else {}) | given
+    preset = MNIH if args.preset == "mnih" else {}
     if args.resume:
         saved = load(args.resume / CHECKPOINT, "checkpoint")
+        given = preset | {"steps": saved["config"]["steps"]} | given  # a preset lengthens nothing
         run = Training(agreed(saved, given, args.resume), args.resume)
         run.lock = lock_folder(args.resume)
         run.restore(saved)
         return lambda: train(run)
-    c = Config(**given)
+    c = Config(**preset | given)
     if c.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device is 'cuda', but torch finds none here: use cpu")
     numbers = (Path(f"runs/{i:03d}") for i in itertools.count(1))
@@ -573,8 +574,8 @@ def agreed(saved: dict, given: dict[str, Any], folder: Path) -> Config:
     differ = ", ".join(f"{k} {getattr(c, k)}, was {was.get(k)}" for k in other)
     if differ:
         raise ValueError(f"{folder} has other settings: {differ}; leave them out or begin anew")
-    if saved["book"]["step"] >= c.steps:
-        raise ValueError(f"{folder} has flown all of its {c.steps:,} steps: give more by --steps")
+    if (flown := saved["book"]["step"]) >= c.steps:
+        raise ValueError(f"{folder} has flown {flown:,} steps: give more by --steps")
     return c
 
 

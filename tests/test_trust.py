@@ -238,7 +238,8 @@ def test_what_does_not_fit_a_checkpoint_is_named(
         ("--lr 0.1 --batch 64", "batch 64, was 8, lr 0.1, was 0.00025"),
         ("--preset mnih", "optimizer rmsprop, was adam"),
         ("--beacon", "beacon True, was False"),
-        ("", "has flown all of its 800 steps"),
+        ("", "has flown 800 steps: give more"),
+        ("--steps 400", "has flown 800 steps: give more"),
     ):
         assert deepflight.main(["train", "--resume", "runs/small", *flags.split()]) == 2
         error = capsys.readouterr().err
