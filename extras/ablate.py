@@ -7,7 +7,8 @@ Every diff in extras/ablations/ takes one piece out of the four files; by hand, 
 and `git apply -R` takes it back. This script applies it to a scratch copy in runs/ablations/, and
 there trains seeds 0 and 1 by the default recipe, on one thread each, as far as step 50,000. What it
 compares them with are the first 50,000 steps of the recipe's own logs, in results/paper and
-results/paper-1. Writes results/ablations/, a log a training, and prints the README's table.
+results/paper-1, and 25,000 of three seeds more; all from one machine: on another, train the recipe
+there too. Writes results/ablations/, a log a training, and prints the README's table.
 """
 
 import csv
@@ -49,6 +50,8 @@ def train(name: str, seed: int) -> None:
             print(f"{name} {seed}: {line}", end="", flush=True)
             if log.exists() and int(read(log)[-1]["step"]) >= STEPS:
                 process.terminate()
+    if int(read(log)[-1]["step"]) < STEPS:
+        raise SystemExit(f"{name}, seed {seed}, stopped before step {STEPS:,}: its log is not kept")
     shutil.copy(log, ROOT / f"results/ablations/{name}-{seed}.csv")
 
 
@@ -61,12 +64,13 @@ def read(log: Path) -> list[dict[str, str]]:
 def figures(log: Path) -> list[float]:
     """Of one training, in %: every column's mean over the early, then over the late test points."""
     windows = [[x for x in read(log) if a <= int(x["step"]) <= b] for a, b in WINDOWS]
-    return [100 * mean(float(x[key]) for x in rows) for rows in windows for key in COLUMNS]
+    return [100 * mean(float(x[key]) for x in rows) for rows in windows if rows for key in COLUMNS]
 
 
 def table() -> list[str]:
     """The README's rows: both seeds of the recipe, and without each piece that has been tried."""
-    logs = {"(the recipe)": list(LOGS.values())}
+    more = [ROOT / f"results/seeds/{seed}.csv" for seed in (2, 3, 4)]  # as far as step 25,000
+    logs = {"(the recipe)": list(LOGS.values()), "(the recipe, seeds 2 to 4)": more}
     for name in DIFFS:
         logs[name] = [ROOT / f"results/ablations/{name}-{seed}.csv" for seed in LOGS]
     rows = []

@@ -1,4 +1,4 @@
-"""Draw every picture of the README from results/, the paper's Figures 2, 3 and 4 among them.
+"""Draw the README's pictures from results/: the paper's Figures 2 to 4, and more; not the atlas.
 
     extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python extras/figures.py
