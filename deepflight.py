@@ -567,8 +567,8 @@ def prepare_train(args: argparse.Namespace) -> Callable[[], int]:
 
 
 def agreed(saved: dict, given: dict[str, Any], folder: Path) -> Config:
-    """The settings of a checkpoint, if nothing that is given now contradicts them; only the number
-    of steps may change, and the learning rate then falls to that."""
+    """The settings of a checkpoint, if nothing that is given now contradicts them. Only the number
+    of steps may change; the learning rate is then that of the new number."""
     c, was = Config(**saved["config"] | given), saved["config"]
     other = [k for k, x in vars(c).items() if x != was.get(k) and k != "steps"]
     differ = ", ".join(f"{k} {getattr(c, k)}, was {was.get(k)}" for k in other)

@@ -51,8 +51,7 @@ def trainings() -> dict[str, list[dict[str, np.ndarray]]]:
     groups = defaultdict(list)
     for folder in sorted(path.parent for path in (ROOT / "results").glob("*/log.csv")):
         config = json.loads((folder / "config.json").read_text())
-        every = "" if config["update_every"] == 4 else f", an update in {config['update_every']}"
-        ours = f"our recipe, {config['steps']:,} steps{every}"
+        ours = f"our recipe, {config['steps']:,} steps"
         recipe = "the paper's settings" if config["optimizer"] == "rmsprop" else ours
         log = read(folder / "log.csv")
         minutes = read(folder / "timing.csv")["seconds"] / 60  # (T,)

@@ -150,6 +150,7 @@ def test_what_the_readme_says_of_the_compass_is_what_was_measured() -> None:
         f"it faces ({x['heading in the middle, degrees off']:.0f}; chance is 90)",
         f"for a side in {x['the far edge taken for side, %']:.0f} % of cases (chance is 50)",
         f"for the far edge in {x['the far edge taken for far, %']:.0f} % (25)",
+        f"the back it knows in {x['the back taken for back, %']:.0f} %",
         f"crosses {x['the laser pilot, straight on: crossed, %']:.1f} % of 500 forests",
         f"and {x['the laser pilot, by compass: crossed, %']:.1f} % with a compass",
     ):
