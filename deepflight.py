@@ -15,7 +15,6 @@ Not in this file: anything about pictures (render.py), flying (env.py) or learni
 """
 
 import argparse
-import itertools
 import json
 import math
 import shlex
@@ -45,9 +44,9 @@ TORCH = str(torch.__version__)
 PRECISION = "bfloat16" if torch.cpu.get_capabilities().get("avx512_bf16") else "float32"
 
 
-def setting(default: Any, text: str, *allowed: Any) -> Any:
+def setting(value: Any, text: str, *allowed: Any) -> Any:
     """One field of Config: default, help with unit and source, and the range or choice allowed."""
-    return field(default=default, metadata={"help": text, "allowed": allowed})
+    return field(default=value, metadata=dict(help=f"{text} (default: {value})", allowed=allowed))
 
 
 @dataclass(frozen=True)
@@ -78,6 +77,7 @@ class Config:
     huber: float = setting(100.0, "Huber's delta: larger errors pull no harder", 1e-3, 1e6)
     huber_after: int = setting(100_000, "control steps with Mnih's delta of 1 before", 0, math.inf)
     optimizer_eps: float = setting(1.5e-4, "the optimizer's epsilon", 0, 1)
+    average: float = setting(0.1, "last share of steps whose mean weights tests fly", 0, 1)
     max_grad_norm: float = setting(10.0, "longer gradients are cut to this; 0: never", 0, math.inf)
     precision: str = setting(PRECISION, "of the convolutions", "bfloat16", "float32")
     device: str = setting("cpu", "cpu; cuda is untested", "cpu", "cuda")
@@ -105,7 +105,7 @@ MNIH = dict(
     steps=1_400_000, n=1, double=False, goal_value=0.0, far_value=0.0, mirror=False,
     target_every=10_000, replay=1_000_000, warmup=50_000, epsilon_final=0.1,
     epsilon_decay=1_000_000, optimizer="rmsprop", lr=2.5e-4, lr_final=2.5e-4, optimizer_eps=0.01,
-    huber=1.0, max_grad_norm=0.0, precision="float32", test_every=20_000,
+    huber=1.0, average=0.0, max_grad_norm=0.0, precision="float32", test_every=20_000,
 )  # fmt: skip
 
 
@@ -247,18 +247,18 @@ class Training:
         eps = linear_schedule(step, c.epsilon_start, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr_final, c.steps)
         delta = c.huber if step > c.huber_after else 1.0
+        share = c.update_every / max(step - (1 - c.average) * c.steps, c.update_every)
         landed = self.advance(self.choose(eps))
         book["episodes"] += len(landed)
         book["recent"] = (book["recent"] + landed)[-100:]
         for _ in range(times_due(step, c.lanes, c.update_every) if step >= c.warmup else 0):
-            self.agent.learn(self.memory, lr, delta, self.learn_rng)
+            self.agent.learn(self.memory, lr, delta, share, self.learn_rng)
         total = sum(p.sum().item() for p in self.agent.q.state_dict().values())
         if not math.isfinite(total):  # as weights are after a loss that is no number
             why = f"{total} at step {step:,}: learning rate too high or optimizer_eps too low?"
             raise FloatingPointError(f"loss, weights: {why} Last good: {self.folder / CHECKPOINT}")
-        row = {"step": step, "episodes": book["episodes"], "updates": self.agent.updates}
-        means = {f"train_{key}": mean(book["recent"], key) for key in ("return", "steps")}
-        return row | {"epsilon": eps} | means
+        row = dict(step=step, episodes=book["episodes"], updates=self.agent.updates, epsilon=eps)
+        return row | {f"train_{key}": mean(book["recent"], key) for key in ("return", "steps")}
 
     def choose(self, eps: float) -> ndarray:
         """An action for every lane (L,), epsilon-greedily."""
@@ -281,7 +281,9 @@ class Training:
 
     def test(self, row: dict[str, float]) -> dict[str, float]:
         """Fly the test forests greedily, log it, and keep the best weights; returns the log row."""
-        book, log, q = self.book, self.book["log"], self.agent.q
+        book, log = self.book, self.book["log"]
+        late = row["step"] > (1 - self.c.average) * self.c.steps
+        q = self.agent.q_target if late else self.agent.q
         flights = measure(fly("dqn", dqn_pilot(q), self.test_seeds, self.world))
         row |= {f"test_{key}": float(values.mean()) for key, values in flights.items()}
         log.append(row | {"test_over_random": row["test_steps"] / book["bar"] - 1})
@@ -289,7 +291,7 @@ class Training:
         for name in ("log", "timing"):
             write_csv(self.folder / f"{name}.csv", book[name])
         aim = "test_goal" if self.c.beacon else "test_crossed"
-        if max(log, key=lambda past: (past[aim], past["test_progress"])) is log[-1]:
+        if late or max(log, key=lambda past: (past[aim], past["test_progress"])) is log[-1]:
             save_weights(self.folder / "best.pt", q, self.c.beacon)
         return log[-1]
 
@@ -431,10 +433,9 @@ def evaluate(args: argparse.Namespace) -> int:
     print_table(figures)
     draw_pictures(flights, seeds, world, args.out)
     if args.json:
-        head = {"weights": str(args.weights), "beacon": args.beacon, "first_seed": seeds[0]}
+        head = dict(weights=str(args.weights), beacon=args.beacon, first_seed=seeds[0])
         report = {p: figures[p] | {"flights": flights[p]} for p in flights}
-        text = json.dumps(head | {"forests": len(seeds), "pilots": report})
-        write_whole(args.json, text.encode())
+        write_whole(args.json, json.dumps(head | dict(forests=len(seeds), pilots=report)).encode())
     return 0
 
 
@@ -527,8 +528,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     which.add_argument("--resume", type=Path, default=None, help="the folder to go on in")
     for f in fields(Config):
         kind = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type}
-        text = f"{f.metadata['help']} (default: {f.default})"
-        sub.add_argument("--" + f.name.replace("_", "-"), help=text, **kind)
+        sub.add_argument("--" + f.name.replace("_", "-"), help=f.metadata["help"], **kind)
     sub = commands.add_parser("eval", help="fly trained weights against three other pilots")
     names = ("random", "straight", "laser", "dqn")
     sub.add_argument("--weights", type=Path, help="default: weights/paper.pt or weights/beacon.pt")
@@ -555,7 +555,7 @@ def prepare_train(args: argparse.Namespace) -> Callable[[], int]:
     c = Config(**preset | given)
     if c.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device is 'cuda', but torch finds none here: use cpu")
-    numbers = (Path(f"runs/{i:03d}") for i in itertools.count(1))
+    numbers = (Path(f"runs/{i:03d}") for i in range(1, 10**6))
     folder = Path("runs") / args.name if args.name else next(p for p in numbers if not p.exists())
     if folder.parent != Path("runs") or folder.name == ".." or folder.exists():
         raise ValueError(f"name is {args.name!r}, allowed is that of a new folder in runs/")

@@ -40,7 +40,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
+from numpy.random import Generator
 from torch import Tensor, nn
 
 # How a transition ended: not at all; cut short by a time limit, after which the world would have
@@ -122,7 +122,7 @@ class Replay:
                 self.last_frames[row, lane] = s2[lane][-1].copy()
         self.added += 1
 
-    def sample(self, size: int, n: int, gamma: float, rng: np.random.Generator) -> Batch:
+    def sample(self, size: int, n: int, gamma: float, rng: Generator) -> Batch:
         """Draw transitions uniformly (line 12) from all but the oldest three rows, which may have
         lost the frames before them, and the newest n, which wait for the rewards after them."""
         oldest = max(self.added - self.rows, 0) + 3
@@ -208,17 +208,18 @@ class DQN(nn.Module):
         self.optimizer = make_optimizer(self.q, settings)
         self.worth = {DEAD: 0.0, GOAL: settings.goal_value, FAR: settings.far_value}
 
-    def learn(self, memory: Replay, lr: float, delta: float, rng: np.random.Generator) -> None:
+    def learn(self, memory: Replay, lr: float, delta: float, share: float, rng: Generator) -> None:
         """One gradient step on a batch from memory (lines 12 to 15).
 
         delta: of Huber's loss, a parabola up to there and straight beyond. 1 is Mnih's clipping of
         errors; it is quick, but with values near 100 it learns the median of what may come, and a
         rare crash does not move a median. A large delta learns the mean.
+        share: 1 resets Q^ = Q every C steps; less moves Q^ that share of the way to Q in each: 1/2,
+        1/3, 1/4 and so on make it a running mean, which lies still where Q is thrown about.
         """
         c = self.settings
         batch = memory.sample(c.batch, c.n, c.gamma, rng)  # line 12
-        if c.mirror:
-            batch = mirror(batch, rng.random(c.batch) < 0.5, self.actions)
+        batch = mirror(batch, rng.random(c.batch) < c.mirror / 2, self.actions)
         # In the shapes of Batch:
         s, a, r, s2, discount, end = (torch.from_numpy(x).to(c.device) for x in batch)
         fast = c.precision == "bfloat16"
@@ -228,7 +229,7 @@ class DQN(nn.Module):
             y = td_target(r, discount, end, choose, value, self.worth)  # (B,) line 13
         q = self.q(s, fast).gather(1, a[:, None])[:, 0]  # (B,)
         # Huber's loss over delta (line 14), so that no error pulls harder than 1.
-        loss = F.smooth_l1_loss(q, y, beta=delta)
+        loss = nn.functional.smooth_l1_loss(q, y, beta=delta)
         self.optimizer.param_groups[0]["lr"] = lr
         self.optimizer.zero_grad()
         loss.backward()
@@ -236,8 +237,9 @@ class DQN(nn.Module):
             nn.utils.clip_grad_norm_(self.q.parameters(), c.max_grad_norm)
         self.optimizer.step()
         self.updates += 1
-        if self.updates % c.target_every == 0:
-            self.q_target.load_state_dict(self.q.state_dict())  # line 15
+        if share < 1 or self.updates % c.target_every == 0:
+            for old, new in zip(self.q_target.parameters(), self.q.parameters(), strict=True):
+                old.data.lerp_(new.data, share)  # line 15
 
 
 def make_optimizer(q: QNetwork, c: Any) -> torch.optim.Optimizer:
@@ -288,5 +290,4 @@ def load(path: Path, kind: str) -> dict:
             raise ValueError(f"{path} holds {content['kind']}, needed: {kind}")
         return content
     except (OSError, EOFError, LookupError, RuntimeError, TypeError, UnpicklingError) as error:
-        why = str(error).partition("\n")[0]
-        raise ValueError(f"{path} cannot be read: {why}") from None
+        raise ValueError(f"{path} cannot be read: {error}".partition("\n")[0]) from None

@@ -33,7 +33,6 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import pymunk
-from numpy import ndarray
 
 from render import PIXELS, Scene, camera, raycast
 
@@ -98,14 +97,14 @@ class World(Scene):
                 raise ValueError(f"a legal world has {rule}; here they are {small:g} and {big:g}")
 
 
-def grid(world: World) -> ndarray:
+def grid(world: World) -> np.ndarray:
     """Trunk centres (N, 2) in m before jitter."""
     x = world.first_x + world.spacing_x * np.arange(world.rows)
     y = world.first_y + world.spacing_y * np.arange(world.columns)
     return np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)  # (N, 2)
 
 
-def plant(seed: int, world: World) -> ndarray:
+def plant(seed: int, world: World) -> np.ndarray:
     """Trunk centres (N, 2) in m: a jittered grid, a function of the seed alone."""
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"seed is {seed!r}, allowed are integers from 0")
@@ -152,7 +151,7 @@ class ForestEnv:
         self.space.add(self.drone, *self.bark)
         self.seed, self.outcome = -1, "not reset"
 
-    def reset(self, *, seed: int | None = None, options: object = None) -> tuple[ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: object = None) -> tuple[np.ndarray, dict]:
         """Plant forest number `seed`, or the one after the last, and stand at the start.
 
         Draws nothing from anywhere: the forest is a function of the seed. `options` is unused.
@@ -169,7 +168,7 @@ class ForestEnv:
         self.observation = np.repeat(self._look()[None], STACK, 0)  # (4, 84, 84)
         return self.observation, self._info()
 
-    def step(self, action: int) -> tuple[ndarray, float, bool, bool, dict]:
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Turn at the action's yaw rate, fly one control step, look.
 
         Returns observation, reward, terminated, truncated, info. info holds d_obs and d_goal in m,
@@ -185,11 +184,10 @@ class ForestEnv:
         self.outcome = self._judge()
         r = reward(self.outcome, self.d_obs, self.d_goal, self.world)
         self.total += r
-        self.observation = np.concatenate([self.observation[1:], self._look()[None]])
-        truncated = self.outcome == "time"
-        return self.observation, r, bool(self.outcome) and not truncated, truncated, self._info()
+        s2 = self.observation = np.concatenate([self.observation[1:], self._look()[None]])
+        return s2, r, self.outcome not in ("", "time"), self.outcome == "time", self._info()
 
-    def scan(self) -> tuple[ndarray, ndarray]:
+    def scan(self) -> tuple[np.ndarray, np.ndarray]:
         """The laser's beams: bearings from the heading (360,) rad, counter-clockwise from dead
         ahead, and distances (360,) m, 20 where nothing is hit."""
         bearings = np.arange(self.world.beams) * (2 * math.pi / self.world.beams)  # (360,)
@@ -199,8 +197,7 @@ class ForestEnv:
 
     def goal_bearing(self) -> float:
         """Angle from the heading to the goal, rad in [-pi, pi], positive to the left."""
-        turn = (self.goal - self.drone.position).angle - self.drone.angle
-        return math.remainder(turn, 2 * math.pi)
+        return math.remainder((self.goal - self.drone.position).angle - self.drone.angle, math.tau)
 
     def flight(self) -> dict:
         """The flight so far: seed and actions, which are all of it, and what came of them."""
@@ -232,13 +229,13 @@ class ForestEnv:
         late = len(self.actions) >= self.world.max_steps
         return "left" if self.edge else "time" if late else ""
 
-    def _look(self) -> ndarray:
+    def _look(self) -> np.ndarray:
         if not self.has_camera:
             return np.zeros((PIXELS, PIXELS), np.uint8)
         beacon = self.goal if self.world.beacon else None
         return camera(self.drone.position, self.drone.angle, self._around(), self.world, beacon)
 
-    def _around(self) -> ndarray:
+    def _around(self) -> np.ndarray:
         """Trunks (K, 2) that eye or laser may reach before the next look-up, 5 m from the last: so
         a step need not look through the whole forest."""
         if math.dist(self.drone.position, self.centre) > 5:

@@ -107,7 +107,7 @@ def updates(batch: int) -> Iterator[int]:
     for _ in range(100):
         run.advance(run.choose(1.0))
     while True:
-        run.agent.learn(run.memory, c.lr, 1.0, run.learn_rng)
+        run.agent.learn(run.memory, c.lr, 1.0, 1.0, run.learn_rng)
         yield 1
 
 

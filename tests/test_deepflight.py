@@ -117,7 +117,7 @@ def test_the_mnih_preset_is_extended_data_table_1() -> None:
     assert (c.optimizer, c.lr, c.lr_final, c.optimizer_eps) == ("rmsprop", 2.5e-4, 2.5e-4, 0.01)
     assert (c.n, c.double, c.mirror, c.huber) == (1, False, False, 1.0)
     assert (c.max_grad_norm, c.precision) == (0.0, "float32")
-    assert (c.goal_value, c.far_value) == (0.0, 0.0)
+    assert (c.goal_value, c.far_value, c.average) == (0.0, 0.0, 0.0)
 
 
 def test_training_test_and_evaluation_forests_are_three_disjoint_ranges() -> None:
@@ -256,6 +256,25 @@ def test_another_seed_is_another_network_in_other_forests(tmp_path: Path) -> Non
         runs[-1].begin()
     assert runs[0].record() != runs[1].record()
     assert (runs[0].agent.q.head[2].weight != runs[1].agent.q.head[2].weight).all()
+
+
+def test_in_the_last_share_of_steps_the_mean_of_the_weights_flies(tmp_path: Path) -> None:
+    c = Config(steps=960, warmup=480, update_every=8, average=0.25, test_forests=1, threads=1)
+    run = Training(c, tmp_path)
+    run.begin()
+    run.book["bar"], newest = 27.0, []
+    for step in range(8, 961, 8):  # an update each
+        row = run.step()
+        newest.append(run.agent.q.head[2].weight.detach().clone())
+        if step == 720:
+            copied, flown = run.agent.q_target.head[2].weight.clone(), newest[-1]
+        if step == 960:
+            flown = torch.stack([copied, *newest[-29:]]).mean(0)
+        if step in (720, 960):
+            run.test(row)
+            saved = deepflight.load_weights(tmp_path / "best.pt", beacon=False).head[2].weight
+            assert torch.allclose(saved, flown, rtol=0, atol=1e-4)
+    assert not torch.allclose(saved, newest[-1], rtol=0, atol=3e-4)
 
 
 # -------------------------------------------------- eval

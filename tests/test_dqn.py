@@ -215,9 +215,9 @@ def test_the_target_network_is_copied_every_so_many_updates_and_not_between() ->
     rng = np.random.default_rng(0)
     start = agent.q_target.head[2].bias.clone()
     for _ in range(SETTINGS.target_every - 1):
-        agent.learn(memory, 1e-3, 1.0, rng)
+        agent.learn(memory, 1e-3, 1.0, 1.0, rng)
     assert (agent.q_target.head[2].bias == start).all()
-    agent.learn(memory, 1e-3, 1.0, rng)
+    agent.learn(memory, 1e-3, 1.0, 1.0, rng)
     assert (agent.q_target.head[2].bias == agent.q.head[2].bias).all()
 
 
@@ -249,7 +249,7 @@ def test_the_agent_solves_a_tiny_mdp(n: int) -> None:
     settings = SimpleNamespace(**(vars(SETTINGS) | {"n": n}))
     agent, memory, rng = DQN(settings, 2, seed=0), corridor(1000), np.random.default_rng(1)
     for update in range(300):
-        agent.learn(memory, linear_schedule(update, 5e-4, 1e-5, 300), 1.0, rng)
+        agent.learn(memory, linear_schedule(update, 5e-4, 1e-5, 300), 1.0, 1.0, rng)
     states = np.stack([stripe(cell) for cell in range(4)])
     assert greedy(agent.q, states).tolist() == [1, 1, 1, 1]
     if n == 1:  # longer windows of a random walk are off-policy, so their values are lower
@@ -265,7 +265,7 @@ def test_clipped_errors_learn_the_median_and_squared_ones_the_mean(
     for step in range(1000):  # one step an episode, and one in ten of them ends badly
         memory.add(stripe(1)[None], np.zeros(1), [-100.0 * (step % 10 == 0)], [stripe(1)], [DEAD])
     for update in range(150):
-        agent.learn(memory, linear_schedule(update, 2e-3, 1e-5, 150), delta, rng)
+        agent.learn(memory, linear_schedule(update, 2e-3, 1e-5, 150), delta, 1.0, rng)
     q = agent.q(torch.from_numpy(stripe(1))[None])[0, 0].item()
     assert q == pytest.approx(learnt, abs=1.5)
 
