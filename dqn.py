@@ -24,9 +24,10 @@ the code below and the training loop in deepflight.py carry these numbers.
     16      end for
     17  end for
 
-Legend: s, a state and action; r the sum of the next n discounted rewards (n = 1: the reward);
-s2 the state after them; gamma the discount of a step, discount that of s2: gamma to the number of
-rewards in r; end how these ended; y the target; B batch, T rows and L lanes of the replay.
+Legend: s, a state and action; r the sum of the next n discounted rewards (n = 1: the reward), with
+what deepflight.py pays for metres ahead; s2 the state after them; gamma the discount of a step,
+discount that of s2: gamma to the number of rewards in r; end how these ended; y the target;
+B batch, T rows and L lanes of the replay.
 At the end, the two functions that write and read files of tensors so that none is ever half there.
 Not in this file: prioritized replay, distributional values, noisy layers.
 """
@@ -44,7 +45,7 @@ from numpy.random import Generator
 from torch import Tensor, nn
 
 # How a transition ended: not at all; cut short by a time limit, after which the world would have
-# gone on; or in a terminal state: a dead one, the goal, or the far side that is nearly the goal.
+# gone on; or in a terminal state: a dead one, the goal, or beyond the far edge.
 LIVE, TRUNCATED, DEAD, GOAL, FAR = range(5)
 
 
@@ -111,7 +112,7 @@ class Replay:
         self.rows, self.lanes = shape
         self.added = 0  # rows ever written
 
-    def add(self, s: np.ndarray, a: np.ndarray, r: list, s2: list, end: list) -> None:
+    def add(self, s: np.ndarray, a: np.ndarray, r: np.ndarray, s2: list, end: list) -> None:
         """Write one transition a lane (line 11): s, s2 (L, 4, 84, 84), a, r, end (L,)."""
         row = self.added % self.rows
         self.frames[row], self.actions[row] = s[:, -1], a
@@ -205,17 +206,17 @@ class DQN(nn.Module):
             self.q = QNetwork(actions).to(settings.device, memory_format=layout)  # line 2
             self.q_target = QNetwork(actions).to(settings.device, memory_format=layout)
         self.q_target.load_state_dict(self.q.state_dict())  # line 3
-        self.optimizer = make_optimizer(self.q, settings)
+        self.optimizer = make_optimizer(self.q.parameters(), settings)
         self.worth = {DEAD: 0.0, GOAL: settings.goal_value, FAR: settings.far_value}
 
     def learn(self, memory: Replay, lr: float, delta: float, share: float, rng: Generator) -> None:
         """One gradient step on a batch from memory (lines 12 to 15).
 
         delta: of Huber's loss, a parabola up to there and straight beyond. 1 is Mnih's clipping of
-        errors; it is quick, but with values near 100 it learns the median of what may come, and a
-        rare crash does not move a median. A large delta learns the mean.
-        share: 1 resets Q^ = Q every C steps; less moves Q^ that share of the way to Q in each: 1/2,
-        1/3, 1/4 and so on make it a running mean, which lies still where Q is thrown about.
+        errors; it is quick, but where values are in the hundreds it learns the median of what may
+        come, and a rare crash does not move a median. A large delta learns the mean.
+        share: 1 resets Q^ = Q every C steps; less moves Q^ that share of the way to Q now. About
+        1/k in the k-th update makes Q^ a running mean, which lies still where Q does not.
         """
         c = self.settings
         batch = memory.sample(c.batch, c.n, c.gamma, rng)  # line 12
@@ -242,12 +243,11 @@ class DQN(nn.Module):
                 old.data.lerp_(new.data, share)  # line 15
 
 
-def make_optimizer(q: QNetwork, c: Any) -> torch.optim.Optimizer:
-    """Adam, or [Mnih15]'s RMSProp."""
-    theta, eps = q.parameters(), c.optimizer_eps
+def make_optimizer(theta: Any, c: Any) -> torch.optim.Optimizer:
+    """Adam, or [Mnih15]'s RMSProp with alpha 0.95, for the weights theta."""
     if c.optimizer == "adam":
-        return torch.optim.Adam(theta, c.lr, eps=eps, fused=True)
-    return torch.optim.RMSprop(theta, c.lr, alpha=0.95, eps=eps, momentum=0.95, centered=True)
+        return torch.optim.Adam(theta, c.lr, eps=c.optimizer_eps, fused=True)
+    return torch.optim.RMSprop(theta, c.lr, 0.95, c.optimizer_eps, momentum=0.95, centered=True)
 
 
 # -------------------------------------------------- files that are whole, or not there

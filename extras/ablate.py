@@ -5,10 +5,10 @@
 
 Every diff in extras/ablations/ takes one piece out of the four files; by hand, `git apply` does it
 and `git apply -R` takes it back. This script applies it to a scratch copy in runs/ablations/, and
-there trains seeds 0 and 1 by the default recipe, on one thread each, as far as step 50,000. What it
-compares them with are the first 50,000 steps of the recipe's own logs, in results/paper and
-results/paper-1, and 25,000 of three seeds more; all from one machine: on another, train the recipe
-there too. Writes results/ablations/, a log a training, and prints the README's table.
+there trains seeds 0 and 1, on one thread each, as far as step 50,000, by the recipe from before a
+metre ahead had its reward. What it compares them with are the first 50,000 steps of that recipe's
+own logs, in results/before, and 25,000 of three seeds more; all from one machine: on another, train
+it there too. Writes results/ablations/, a log a training, and prints the README's table.
 """
 
 import csv
@@ -23,7 +23,8 @@ from statistics import mean
 ROOT = Path(__file__).parent.parent
 DIFFS = {path.stem: path for path in sorted((ROOT / "extras/ablations").glob("*.diff"))}
 FILES = ("render.py", "env.py", "dqn.py", "deepflight.py")
-LOGS = {0: ROOT / "results/paper/log.csv", 1: ROOT / "results/paper-1/log.csv"}  # of the recipe
+BEFORE = ROOT / "results/before"
+LOGS = {0: BEFORE / "paper/log.csv", 1: BEFORE / "paper-1/log.csv"}  # of the recipe
 STEPS = 50_000
 WINDOWS = ((10_000, 25_000), (30_000, STEPS))  # a figure is the mean of the test points therein
 COLUMNS = ("test_over_random", "test_crash")
@@ -43,7 +44,8 @@ def copy(name: str, folder: Path) -> Path:
 def train(name: str, seed: int) -> None:
     """Train one seed without that piece, and keep its log."""
     folder = copy(name, ROOT / f"runs/ablations/{name}-{seed}")
-    command = [sys.executable, "deepflight.py", "train", "--threads", "1", "--seed", str(seed)]
+    command = [sys.executable, "deepflight.py", "train", "--ahead", "0", "--far-value", "50"]
+    command += ["--threads", "1", "--seed", str(seed)]
     log = folder / "runs/001/log.csv"
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
         for line in process.stdout:
@@ -69,7 +71,7 @@ def figures(log: Path) -> list[float]:
 
 def table() -> list[str]:
     """The README's rows: both seeds of the recipe, and without each piece that has been tried."""
-    more = [ROOT / f"results/seeds/{seed}.csv" for seed in (2, 3, 4)]  # as far as step 25,000
+    more = [BEFORE / f"seeds/{seed}.csv" for seed in (2, 3, 4)]  # as far as step 25,000
     logs = {"(the recipe)": list(LOGS.values()), "(the recipe, seeds 2 to 4)": more}
     for name in DIFFS:
         logs[name] = [ROOT / f"results/ablations/{name}-{seed}.csv" for seed in LOGS]

@@ -4,7 +4,7 @@
     extras/.venv/bin/python extras/figures.py
 
 figures/learning.png: every folder of results/ with a log.csv is a training in the world its
-config.json names; those of one world, optimizer and length are one curve, their spread a band.
+config.json names; those of one world, recipe and length are one curve, their spread a band.
 figures/crossed.png: what crossed in the paper's world, beside the laser pilot with and without a
 compass. figures/flights.png and flight.gif: the flights of results/eval.json, flown again.
 """
@@ -28,8 +28,9 @@ from env import World  # noqa: E402
 
 PAPER = 1.8  # the paper's figure: 180 % more flight time than random [DF, abstract]
 CROSSED = {  # log in results/ -> label
-    "paper/log.csv": "recipe, seed 0",
-    "paper-1/log.csv": "recipe, seed 1",
+    "paper/log.csv": "our recipe",
+    "before/paper/log.csv": "the recipe before, seed 0",
+    "before/paper-1/log.csv": "the recipe before, seed 1",
     "tried/far-and-dead.csv": "an update in 16 steps, ends worth +200 and -100",
 }
 PANELS = {  # column of log.csv -> title
@@ -49,9 +50,10 @@ def read(path: Path) -> dict[str, np.ndarray]:
 def trainings() -> dict[str, list[dict[str, np.ndarray]]]:
     """The logs of every training in results/, by what it was."""
     groups = defaultdict(list)
-    for folder in sorted(path.parent for path in (ROOT / "results").glob("*/log.csv")):
+    for folder in sorted(path.parent for path in (ROOT / "results").rglob("log.csv")):
         config = json.loads((folder / "config.json").read_text())
-        ours = f"our recipe, {config['steps']:,} steps"
+        ours = "our recipe" if "ahead" in config else "the recipe before"
+        ours += f", {config['steps']:,} steps"
         recipe = "the paper's settings" if config["optimizer"] == "rmsprop" else ours
         log = read(folder / "log.csv")
         minutes = read(folder / "timing.csv")["seconds"] / 60  # (T,)

@@ -25,7 +25,7 @@ from deepflight import (
     summarize,
     wilson,
 )
-from dqn import QNetwork
+from dqn import QNetwork, load
 from env import World, refly
 
 ROOT = Path(__file__).parent.parent
@@ -117,7 +117,23 @@ def test_the_mnih_preset_is_extended_data_table_1() -> None:
     assert (c.optimizer, c.lr, c.lr_final, c.optimizer_eps) == ("rmsprop", 2.5e-4, 2.5e-4, 0.01)
     assert (c.n, c.double, c.mirror, c.huber) == (1, False, False, 1.0)
     assert (c.max_grad_norm, c.precision) == (0.0, "float32")
-    assert (c.goal_value, c.far_value, c.average) == (0.0, 0.0, 0.0)
+    assert (c.goal_value, c.far_value, c.ahead, c.average) == (0.0, 0.0, 0.0, 0.0)
+
+
+def test_where_the_beacon_shows_the_goal_nothing_else_is_worth_as_much(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    small = "--threads 1 --replay 400 --warmup 400"
+    for line, worth in (
+        ("", (125, 200, 6)),
+        ("--beacon", (125, 50, 0)),
+        ("--beacon --ahead 1", (125, 50, 1)),
+    ):
+        deepflight.prepare_train(deepflight.parse(f"train {small} {line}".split()))
+        newest = max((tmp_path / "runs").iterdir()) / "checkpoint.pt"
+        c = load(newest, "checkpoint")["config"]
+        assert (c["goal_value"], c["far_value"], c["ahead"]) == worth
 
 
 def test_training_test_and_evaluation_forests_are_three_disjoint_ranges() -> None:
@@ -275,6 +291,20 @@ def test_in_the_last_share_of_steps_the_mean_of_the_weights_flies(tmp_path: Path
             saved = deepflight.load_weights(tmp_path / "best.pt", beacon=False).head[2].weight
             assert torch.allclose(saved, flown, rtol=0, atol=1e-4)
     assert not torch.allclose(saved, newest[-1], rtol=0, atol=3e-4)
+
+
+def test_a_metre_ahead_is_worth_its_reward_in_the_target_and_not_in_the_report(
+    tmp_path: Path,
+) -> None:
+    runs = [Training(Config(lanes=1, ahead=ahead, threads=1), tmp_path) for ahead in (0.0, 3.0)]
+    for run in runs:
+        run.take_off(0)
+        for a in (4, 8, 8, 8, 0):
+            run.advance(np.array([a]))
+    plain, paid = (run.memory.rewards[:5, 0] for run in runs)
+    headings = 0.07 * np.array([0, 1, 2, 3, 2])  # rad: 0.7 rad/s for 0.1 s each
+    assert paid - plain == pytest.approx(3 * 0.5 * np.cos(headings), abs=1e-5)
+    assert runs[0].envs[0].total == runs[1].envs[0].total
 
 
 # -------------------------------------------------- eval

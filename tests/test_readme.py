@@ -79,7 +79,14 @@ def test_the_readme_counts_how_the_headline_flights_ended() -> None:
         "of 1,000 flights {far} left by the far edge, {side} by a side, {back} by the back; {goal} "
     )
     counts += "arrived, {crash} crashed and {time} ran out of time"
-    assert counts.format(**ends) in FLAT
+    assert counts.format_map(ends) in FLAT
+    flights = report("paper")["pilots"]["dqn"]["flights"]
+    sides = [f["progress"] > 80 for f in flights if f["edge"] == "side"]
+    assert f"{np.mean([f['progress'] > 80 for f in flights]):.0%}".replace("%", " %") in FLAT
+    assert f"of the {len(sides)} that did, two thirds" in FLAT
+    now, before = (report(x)["pilots"]["dqn"]["return"]["value"] for x in ("paper", "before/paper"))
+    assert f"{now:.1f} on the headline forests where the recipe before had {before:.1f}" in FLAT
+    assert np.mean(sides) == pytest.approx(2 / 3, abs=0.05)
 
 
 def test_the_papers_settings_rise_and_fall_when_the_readme_says() -> None:
@@ -94,26 +101,28 @@ def test_the_papers_settings_rise_and_fall_when_the_readme_says() -> None:
 
 
 def test_the_five_seeds_figures_are_those_of_their_logs_and_flights() -> None:
-    over = [report(f"seeds/{seed}")["pilots"]["dqn"]["over_random"]["value"] for seed in range(5)]
-    figures = [f"{100 * x:+.0f}" for x in over]
+    flown = [report(f"before/seeds/{seed}")["pilots"]["dqn"] for seed in range(5)]
+    figures = [f"{100 * pilot['over_random']['value']:+.0f}" for pilot in flown]
     assert f"{', '.join(figures[:4])} and {figures[4]} %" in FLAT
     for seed in range(5):
-        rows = list(csv.DictReader((ROOT / f"results/seeds/{seed}.csv").open()))
+        rows = list(csv.DictReader((ROOT / f"results/before/seeds/{seed}.csv").open()))
         passed = (int(row["step"]) for row in rows if float(row["test_over_random"]) > 1.8)
         assert next(passed) in (10_000, 15_000)
 
 
-def test_the_other_trainings_flew_as_the_readme_says() -> None:
-    for name, label in (
-        ("paper-1", "paper's world, seed 1"),
-        ("beacon-0", "with the beacon, seed 0"),
-        ("beacon-1", "with the beacon, seed 1"),
+def test_the_trainings_before_flew_as_the_readme_says() -> None:
+    for name, forests, label in (
+        ("paper", 1000, "paper's world, seed 0"),
+        ("paper-1", 500, "paper's world, seed 1"),
+        ("beacon", 500, "with the beacon, seed 0"),
+        ("beacon-1", 500, "with the beacon, seed 1"),
     ):
-        assert (report(name)["forests"], report(name)["first_seed"]) == (500, 3 * 10**9)
-        row = f"| {label} |"
+        flown = report(f"before/{name}")
+        assert (flown["forests"], flown["first_seed"]) == (forests, 3 * 10**9)
+        row = f"| {label} | {forests:,} |"
         for key in ("over_random", "crossed", "goal", "crash"):
             digits, sign = (0, "+") if key == "over_random" else (1, "")
-            shown = report(name)["pilots"]["dqn"][key]
+            shown = flown["pilots"]["dqn"][key]
             x = {k: f"{100 * v:.{digits}f}" for k, v in shown.items()}
             row += f" {sign}{x['value']} % [{x['low']}, {x['high']}] |"
         assert row in README
@@ -153,6 +162,7 @@ def test_what_the_readme_says_of_the_compass_is_what_was_measured() -> None:
         f"the back it knows in {x['the back taken for back, %']:.0f} %",
         f"crosses {x['the laser pilot, straight on: crossed, %']:.1f} % of 500 forests",
         f"and {x['the laser pilot, by compass: crossed, %']:.1f} % with a compass",
+        f"{x['the laser pilot, along the rows: crossed, %']:.1f} % if it turns back along the rows",
     ):
         assert said in FLAT
 
