@@ -190,7 +190,8 @@ def test_the_atlas_says_what_the_readme_says() -> None:
     assert f"crosses {camera:.0f} % at 5 m/s, the laser {laser:.0f} %" in FLAT
     crashes = [flight for flight in atlas["worst"] if flight["outcome"] == "crash"]
     assert len(crashes) < len(atlas["worst"])  # so these are all of the crashes
-    assert f"it crashed in {len(crashes)}, all of them in the last 13 m" in FLAT
-    assert min(flight["progress"] for flight in crashes) > 90 - 13
-    assert {flight["cause"] for flight in crashes} == {"careless"}
+    late = sum(flight["progress"] > 90 - 12 for flight in crashes)
+    assert f"it crashed in {len(crashes)}, {late} of them in the last 12 m" in FLAT
+    careless = sum(flight["cause"] == "careless" for flight in crashes)
+    assert f"and {careless} of them not helpless: it had seen the trunk" in FLAT
     assert f"--first-seed {atlas['worst'][0]['seed']}" in FLAT
