@@ -143,6 +143,8 @@ def test_the_readme_says_how_blind_the_papers_settings_became() -> None:
 def test_the_clock_in_the_readme_is_the_measured_one() -> None:
     clock = json.loads((ROOT / "results/clock.json").read_text())
     assert f"passes +180 % after {clock['median']:.0f} s" in FLAT
+    assert "and 10,000 steps, with each of seeds 0 to 4" in FLAT
+    assert {seed["step"] for seed in clock["seeds"].values()} == {10_000}
     minutes = clock["mnih, to the figure"] / 60
     assert f"the paper's settings after some {minutes:.0f} minutes" in FLAT
 
@@ -194,4 +196,7 @@ def test_the_atlas_says_what_the_readme_says() -> None:
     assert f"it crashed in {len(crashes)}, {late} of them in the last 12 m" in FLAT
     careless = sum(flight["cause"] == "careless" for flight in crashes)
     assert f"and {careless} of them not helpless: it had seen the trunk" in FLAT
+    beacon = [f for f in report("beacon")["pilots"]["dqn"]["flights"] if f["outcome"] == "crash"]
+    late = sum(flight["progress"] > 90 - 12 for flight in beacon)
+    assert f"Of its {len(beacon)} crashes in the 1,000 headline forests, {late} lie there" in FLAT
     assert f"--first-seed {atlas['worst'][0]['seed']}" in FLAT
