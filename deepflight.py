@@ -1,17 +1,27 @@
 """deepflight.py: the experiment. Train a pilot, fly it against others, print honest numbers.
 
     python deepflight.py train                  the default recipe, in the paper's world
-    python deepflight.py train --beacon         where the goal is visible
+    python deepflight.py train --beacon         where a pole makes the goal visible
     python deepflight.py train --preset mnih    the paper's training parameters [Mnih15]
     python deepflight.py train --resume DIR     go on with an interrupted training
     python deepflight.py eval                   fly weights/paper.pt against three other pilots
     python deepflight.py eval --beacon          fly weights/beacon.pt where the goal is visible
 
-Seeds: training plants forests from [0, 10^9), test points choose weights on [10^9, 2 * 10^9), and
-`eval` flies from 2 * 10^9 on unless told otherwise: forests that neither shaped nor chose weights.
-A run's folder holds config.json, log.csv, timing.csv, best.pt and checkpoint.pt, each whole at any
-time; while a training runs, it alone holds the folder's lock.
-Not in this file: anything about pictures (render.py), flying (env.py) or learning (dqn.py).
+The story stands first: the settings, what the learner is paid, `train`, `evaluate`. The plumbing
+stands last: files, signals, clocks, the command line.
+
+A seed is a forest. Training plants forests from [0, 10^9). Test points choose the weights to keep,
+and fly forests from [10^9, 2 * 10^9). `eval` starts at 2 * 10^9, so its forests neither shaped the
+weights nor chose them. A run's folder holds config.json, log.csv, best.pt and checkpoint.pt.
+
+Legend
+    L  drones that fly side by side
+    B  transitions in a batch
+    A  actions
+    F  flights
+    The other symbols are those of dqn.py.
+
+Not in this file: anything about pictures (render.py), flying (env.py) or networks (dqn.py).
 """
 
 import argparse
@@ -19,457 +29,200 @@ import json
 import math
 import shlex
 import signal
-import sqlite3
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import torch
 from numpy import ndarray
+from numpy.random import Generator
 
 import dqn
+import env
 import render
-from dqn import DQN, QNetwork, Replay, greedy, linear_schedule, load, save, write_whole
-from env import OUTCOMES, ForestEnv, World, plant, refly
+from dqn import Agent, DQNConfig, QNetwork, Replay, greedy, linear_schedule, mirror, td_target
+from env import OUTCOMES, Fleet, Flights, Pilot, World, fly, fly_random, measure, refly, show
 
 TRAIN_END, TEST_FIRST, EVAL_FIRST = 10**9, 10**9, 2 * 10**9  # forest seeds
-CHECKPOINT = "checkpoint.pt"
-RANDOM_FLIGHTS = 2000  # a hundred would move the bar itself, random's mean flight, by a fifth
-TORCH = str(torch.__version__)
-# Where the processor has no bfloat16 of its own, float32 is faster.
-PRECISION = "bfloat16" if torch.cpu.get_capabilities().get("avx512_bf16") else "float32"
-
-
-def setting(value: Any, text: str, *allowed: Any) -> Any:
-    """One field of Config: default, help with unit and source, and the range or choice allowed."""
-    return field(default=value, metadata=dict(help=f"{text} (default: {value})", allowed=allowed))
+TESTS = range(TEST_FIRST, TEST_FIRST + 48)  # the forests of a test point
 
 
 @dataclass(frozen=True)
-class Config:
-    """Every setting of a training; each is a flag of `train`."""
+class RunConfig:
+    """The experiment's settings; dqn.py has those of the algorithm. Each is a flag of `train`."""
 
-    steps: int = setting(300_000, "control steps in all", 1, math.inf)
-    seed: int = setting(0, "of everything random", 0, math.inf)
-    beacon: bool = setting(False, "put a visible pole at the goal", 0, 1)
-    lanes: int = setting(8, "drones flown at once, one forest each", 1, 1000)
-    gamma: float = setting(0.99, "discount a step [DF II-A]", 0, 1)
-    n: int = setting(5, "rewards in a return before the bootstrap", 1, 100)
-    double: bool = setting(True, "let Q choose the action that the target network values", 0, 1)
-    goal_value: float = setting(125.0, "of arrival in the target: 1.25 a step for ever", -1e6, 1e6)
-    far_value: float = setting(200.0, "of leaving by the far edge in the target", -1e6, 1e6)
-    ahead: float = setting(6.0, "reward in the target for a metre nearer the far edge", 0, 1e3)
-    mirror: bool = setting(True, "reflect half of every batch left to right", 0, 1)
-    batch: int = setting(32, "transitions an update [Mnih15]", 1, 10_000)
-    update_every: int = setting(4, "control steps an update [Mnih15]", 1, math.inf)
-    target_every: int = setting(500, "updates between copies to the target network", 1, math.inf)
-    replay: int = setting(200_000, "transitions remembered, 7.1 kB each", 1, math.inf)
-    warmup: int = setting(5_000, "control steps before the first update", 1, math.inf)
-    epsilon_start: float = setting(1.0, "share of random actions at first [Mnih15]", 0, 1)
-    epsilon_final: float = setting(0.05, "share of random actions in the end", 0, 1)
-    epsilon_decay: int = setting(40_000, "control steps from first to final", 1, math.inf)
-    optimizer: str = setting("adam", "adam, or Mnih's rmsprop", "adam", "rmsprop")
-    lr: float = setting(2.5e-4, "learning rate at first", 0, 1)
-    lr_final: float = setting(2.5e-5, "and in the end, linear between", 0, 1)
-    huber: float = setting(100.0, "Huber's delta: larger errors pull no harder", 1e-3, 1e6)
-    huber_after: int = setting(100_000, "control steps with Mnih's delta of 1 before", 0, math.inf)
-    optimizer_eps: float = setting(1.5e-4, "the optimizer's epsilon", 0, 1)
-    average: float = setting(0.1, "last share of the steps: the mean of Q is Q^ and flies", 0, 1)
-    max_grad_norm: float = setting(10.0, "longer gradients are cut to this; 0: never", 0, math.inf)
-    precision: str = setting(PRECISION, "of the convolutions", "bfloat16", "float32")
-    device: str = setting("cpu", "cpu; cuda is untested", "cpu", "cuda")
-    threads: int = setting(2, "of torch; another number gives other last digits", 1, 256)
-    torch: str = setting(TORCH, "its version, noted here since others differ", TORCH)
-    test_every: int = setting(5_000, "control steps between test points", 1, math.inf)
-    test_forests: int = setting(48, "forests a test point", 1, 10_000)
-    checkpoint_every: int = setting(5_000, "control steps between checkpoints", 1, math.inf)
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            value, allowed = getattr(self, f.name), f.metadata["allowed"]
-            legal = value in allowed if f.type is str else allowed[0] <= value <= allowed[1]
-            if not legal:
-                text = " or ".join(allowed) if f.type is str else "{:g} to {:g}".format(*allowed)
-                raise ValueError(f"{f.name} is {value}, allowed: {text}")
-        # The least: three rows to complete a stack, n that wait for rewards, one to draw.
-        given, least = min(self.replay, self.warmup), self.lanes * (self.n + 4)
-        if given < least:
-            raise ValueError(f"replay or warmup is {given}, below lanes * (n + 4) = {least}")
+    seed: int = dqn.setting(0, "of everything random", 0)
+    beacon: bool = dqn.setting(False, "put a visible pole at the goal", 0, 1)
+    threads: int = dqn.setting(2, "of torch; another number gives other last digits", 1, 256)
+    test_every: int = dqn.setting(5_000, "control steps between test points, which also save", 1)
+    forward_reward: float = dqn.setting(6.0, "[+] for a metre nearer the far edge; 0: off", 0, 1e3)
+    goal_value: float = dqn.setting(125.0, "[+] of the state after arrival; 0: off", -1e6, 1e6)
+    far_value: float = dqn.setting(200.0, "[+] of that beyond the far edge; 0: off", -1e6, 1e6)
 
 
-# [Mnih15, Extended Data Table 1], as the paper says [DF II-B]; 1.4 M steps are the paper's own
+SETTINGS = (*fields(DQNConfig), *fields(RunConfig))
+# With the beacon the goal can be seen, so no other way out should be worth as much.
+BEACON = {"forward_reward": 0.0, "far_value": 50.0}
+# [Mnih15, Extended Data Table 1], as the paper says [DF §II-B]; 1.4 M steps are the paper's own.
 MNIH = dict(
-    steps=1_400_000, n=1, double=False, goal_value=0.0, far_value=0.0, ahead=0.0, mirror=False,
-    target_every=10_000, replay=1_000_000, warmup=50_000, epsilon_final=0.1,
-    epsilon_decay=1_000_000, optimizer="rmsprop", lr=2.5e-4, lr_final=2.5e-4, optimizer_eps=0.01,
-    huber=1.0, average=0.0, max_grad_norm=0.0, precision="float32", test_every=20_000,
+    steps=1_400_000, replay_size=1_000_000, learning_starts=50_000, target_every=10_000,
+    epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, double=False, n_steps=1, mirror=False,
+    huber=1.0, lr_decay=1.0, max_grad_norm=0.0, average=0.0, bfloat16=False, forward_reward=0.0,
+    goal_value=0.0, far_value=0.0,
 )  # fmt: skip
 
-# Of `train --beacon`: where the goal can be seen, no other way out should be worth as much.
-BEACON = dict(far_value=50.0, ahead=0.0)
+
+# -------------------------------------------------- what the learner is paid
 
 
-# -------------------------------------------------- pilots: a list of forests -> an action in each
+def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: float) -> ndarray:
+    """The rewards (L,) that the network learns from: the paper's r, and what makes a pilot cross.
 
-Pilot = Callable[[Sequence[ForestEnv]], Sequence[int]]
-Flights = list[dict]  # of ForestEnv.flight
+    r (L,): the paper's rewards of a step. infos: what ForestEnv.step says of each drone.
 
+    | part                           | size, by default         | why                             |
+    |--------------------------------|--------------------------|---------------------------------|
+    | r                              | -10, or -5.1 to 1.25     | the paper [DF §II-A]            |
+    | forward_reward * metres gained | 6 * 0.5 m: -3.0 to 3.0   | r pays for being somewhere and  |
+    |                                |                          | not for getting on, so circling |
+    |                                |                          | pays as well as crossing        |
+    | gamma * goal_value, arriving   | 0.99 * 125 = 123.75      | a drone that circled the goal   |
+    |                                |                          | for ever would earn 1.25 a step |
+    |                                |                          | and 1.25 / (1 - gamma) = 125 in |
+    |                                |                          | all, so a plain end is a loss   |
+    | gamma * far_value, leaving by  | 0.99 * 200 = 198         | no picture shows which edge is  |
+    | the far edge                   |                          | the far one, so it must be dear |
 
-def random_pilot(rng: np.random.Generator) -> Pilot:
-    """Every action uniform and independent: the paper's bar."""
-    return lambda envs: rng.integers(envs[0].world.actions, size=len(envs))
-
-
-def straight_pilot(envs: Sequence[ForestEnv]) -> Sequence[int]:
-    """Dead ahead, whatever comes."""
-    return [env.world.actions // 2 for env in envs]
-
-
-def laser_pilot(envs: Sequence[ForestEnv]) -> Sequence[int]:
-    """A dynamic window on the scan and the goal's bearing: the bar for the camera."""
-    return [dynamic_window(*env.scan(), env.goal_bearing(), env.world) for env in envs]
-
-
-def dynamic_window(bearings: ndarray, distances: ndarray, goal_bearing: float, world: World) -> int:
-    """Simulate 1.5 s of each yaw rate against the scan's points and take the best.
-
-    score = 10 * seconds until the clearance is below 0.8 m + 2 * least clearance (2 m at most)
-            - 4 * heading error to the goal at the arc's end in rad
+    In the field's words this is reward shaping. It is not the potential-based kind [Ng 1999], which
+    keeps the best policy what it was: ours is meant to change it. Only the learner sees it. Every
+    return that is printed or logged is the paper's.
     """
-    # In the drone's axes a point is the complex number x + iy.
-    points = (distances * np.exp(1j * bearings))[distances < world.laser_range]  # (P,) m
-    rates = world.yaw_rate * np.linspace(-1, 1, world.actions)  # (A,) rad/s
-    headings = rates[:, None] * world.dt * np.arange(1, 16)  # (A, 15) rad
-    arcs = np.cumsum(world.speed * world.dt * np.exp(1j * headings), 1)  # (A, 15) m
-    clearance = np.abs(arcs[..., None] - points).min(-1, initial=world.laser_range)  # (A, 15) m
-    safe = np.logical_and.accumulate(clearance >= 0.8, 1).sum(1) * world.dt  # (A,) s
-    error = np.abs(np.angle(np.exp(1j * (goal_bearing - headings[:, -1]))))  # (A,) rad, wrapped
-    return int(np.argmax(10 * safe + 2 * np.minimum(clearance.min(1), 2) - 4 * error))
-
-
-def dqn_pilot(q: QNetwork) -> Pilot:
-    """The greedy policy of a Q-network: four frames and nothing else."""
-    return lambda envs: greedy(q, np.stack([env.observation for env in envs]))
-
-
-def fly(who: str, pilot: Pilot, seeds: Sequence[int], world: World, camera: bool = True) -> Flights:
-    """Fly one forest a seed, a hundred at once; returns the flights in the order of the seeds."""
-    flights, fleet = [], [ForestEnv(world, camera=camera) for _ in seeds[:100]]
-    for group in (seeds[i : i + 100] for i in range(0, len(seeds), 100)):
-        envs = fleet[: len(group)]
-        for env, seed in zip(envs, group, strict=True):
-            env.reset(seed=seed)
-        while flying := [env for env in envs if not env.outcome]:
-            show(f"{who}: {len(flights) + len(envs) - len(flying):,} of {len(seeds):,} landed")
-            for env, a in zip(flying, pilot(flying), strict=True):
-                env.step(a)
-        flights += [env.flight() for env in envs]
-    return flights
-
-
-def fly_random(seeds: Sequence[int], world: World, rng: np.random.Generator) -> Flights:
-    """The bar: 2,000 random flights or more, equally many through each forest."""
-    repeats = math.ceil(RANDOM_FLIGHTS / len(seeds))
-    return fly("random", random_pilot(rng), list(seeds) * repeats, world, camera=False)
-
-
-def measure(flights: Flights) -> dict[str, ndarray]:
-    """One number a flight (F,): steps, progress in m, return, and 0 or 1 for how it ended.
-
-    Crossed means arrived at the goal or left by the far edge.
-    """
-    table = {key: np.array([f[key] for f in flights]) for key in ("steps", "progress", "return")}
-    table["crossed"] = np.array([f["outcome"] == "goal" or f["edge"] == "far" for f in flights])
-    return table | {o: np.array([f["outcome"] == o for f in flights]) for o in OUTCOMES}
-
-
-def mean(flights: Flights, key: str) -> float:
-    """Of the flights, or not a number where none has ended yet."""
-    return sum(f[key] for f in flights) / len(flights) if flights else math.nan
+    forward = np.array([info["forward"] for info in infos])  # (L,) m
+    arrived = np.array([info.get("outcome") == "goal" for info in infos])  # (L,)
+    far = np.array([info.get("edge") == "far" for info in infos])  # (L,)
+    # [+forward_reward] [+goal_value] [+far_value]
+    return r + rc.forward_reward * forward + gamma * (rc.goal_value * arrived + rc.far_value * far)
 
 
 # -------------------------------------------------- train
 
-END = {"": dqn.LIVE, "far": dqn.FAR, "goal": dqn.GOAL, "time": dqn.TRUNCATED}  # else DEAD
-COLUMNS = {  # a status line: key -> heading, format
-    "step": ("step", "9,"), "episodes": ("episodes", "9,"), "epsilon": ("epsilon", "8.2f"),
-    "speed": ("steps/s", "8.0f"), "eta": ("min left", "9.1f"),
-    "train_return": (" | train: return", "16.1f"), "train_steps": ("steps", "7.1f"),
-    "test_return": (" | test: return", "15.1f"), "test_steps": ("steps", "7.1f"),
-    "test_over_random": ("over random", "12.0%"), "test_progress": ("progress", "9.1f"),
-    **{f"test_{key}": (key, "8.0%") for key in ("crossed", "crash", "goal", "left", "time")},
-}  # fmt: skip
 
-
-class Training:
-    """All that a training is made of: it flies, learns, tests, saves itself and is taken up again.
-
-    At first Q flies in tests, and Q^ is a copy of it now and then. In the last share of the steps,
-    c.average, Q^ is the mean of Q since then: it is still what Q learns from, and it flies in tests
-    and becomes best.pt, for what one more update does to Q moves a mean little.
-    book: step, log and what else is a plain number. flights: of every lane, the seed and the
-    actions of each flight in the replay and of the one in the air. These are all that a checkpoint
-    keeps of the replay, one byte a step: a flight is its seed and its actions.
-    """
-
-    def __init__(self, c: Config, folder: Path) -> None:
-        torch.set_flush_denormal(True)  # else RMSProp's dead moments, below 1e-38, halve the speed
-        torch.set_num_threads(c.threads)
-        self.c, self.folder, self.world, self.stopped = c, folder, World(beacon=c.beacon), 0
-        self.fly_rng, self.learn_rng, self.bar_rng = np.random.default_rng(c.seed).spawn(3)
-        self.test_seeds = range(TEST_FIRST, TEST_FIRST + c.test_forests)
-        self.memory = Replay(c.replay, c.lanes)  # line 1
-        self.agent = DQN(c, self.world.actions, c.seed)  # lines 2, 3
-        self.envs = [ForestEnv(self.world) for _ in range(c.lanes)]
-        self.flights: list[list] = [[] for _ in self.envs]
-        self.plans: list[Iterator[int]] = [iter(()) for _ in self.envs]  # seeds flown before
-        self.book = dict(step=0, episodes=0, seconds=0.0, recent=[], log=[], timing=[], best=[])
-
-    def stop(self, number: int, _frame: object) -> None:
-        """A first Ctrl-C or SIGTERM lets the step end and saves; a second stops at once."""
-        if self.stopped:
-            raise KeyboardInterrupt
-        self.stopped = number
-
-    def begin(self) -> None:
-        """Take off in every lane, and save, so that all that follows can be interrupted."""
-        for lane in range(self.c.lanes):
-            self.take_off(lane)
-        self.save()
-
-    def take_off(self, lane: int) -> None:
-        """Begin an episode (lines 4, 5) and its record, which grows as the drone flies."""
-        seed = next(self.plans[lane], int(self.fly_rng.integers(TRAIN_END)))
-        self.envs[lane].reset(seed=seed)
-        self.flights[lane].append((seed, self.envs[lane].actions))
-
-    def step(self) -> dict[str, float]:
-        """One control step in every lane (line 6) and the updates then due; returns a log row."""
-        c, book = self.c, self.book
-        step = book["step"] = book["step"] + c.lanes
-        eps = linear_schedule(step, c.epsilon_start, c.epsilon_final, c.epsilon_decay)
-        lr = linear_schedule(step, c.lr, c.lr_final, c.steps)
+def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | None = None) -> int:
+    """Algorithm 1 of [Mnih15]; the numbers are its lines, as dqn.py lists them. Returns the exit
+    code. folder: of the run's files. saved: a checkpoint to go on with."""
+    world, rng = World(beacon=rc.beacon), np.random.default_rng(rc.seed)
+    replay = Replay(c.replay_size, c.num_envs)  # 1
+    agent = Agent(c, world.actions, rc.seed)  # 2, 3
+    fleet = Fleet(world, c.num_envs)  # [+num_envs] one pass through Q serves all drones
+    run = Run(folder, c, rc, (agent, replay, fleet, rng), saved)
+    for step in run.steps():
+        epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
+        # [+lr_decay] Large strides at first, small ones to settle.
+        lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)
+        agent.optimizer.param_groups[0]["lr"] = lr
+        # [+huber] Mnih clips errors to 1. That is quick, but it learns the median of what may come,
+        # and a rare crash does not move a median. A large delta learns the mean.
         delta = c.huber if step > c.huber_after else 1.0
-        share = c.update_every / max(step - (1 - c.average) * c.steps, c.update_every)
-        landed = self.advance(self.choose(eps))
-        book["episodes"] += len(landed)
-        book["recent"] = (book["recent"] + landed)[-100:]
-        for _ in range(times_due(step, c.lanes, c.update_every) if step >= c.warmup else 0):
-            self.agent.learn(self.memory, lr, delta, share, self.learn_rng)
-        total = sum(p.sum().item() for p in self.agent.q.state_dict().values())
-        if not math.isfinite(total):  # as weights are after a loss that is no number
-            why = f"{total} at step {step:,}: learning rate too high or optimizer_eps too low?"
-            raise FloatingPointError(f"loss, weights: {why} Last good: {self.folder / CHECKPOINT}")
-        row = dict(step=step, episodes=book["episodes"], updates=self.agent.updates, epsilon=eps)
-        return row | {f"train_{key}": mean(book["recent"], key) for key in ("return", "steps")}
 
-    def choose(self, eps: float) -> ndarray:
-        """An action for every lane (L,), epsilon-greedily."""
-        s = np.stack([env.observation for env in self.envs])  # (L, 4, 84, 84)
-        explore = self.fly_rng.random(len(s)) < eps  # (L,) line 7
-        anything = self.fly_rng.integers(self.world.actions, size=len(s))  # (L,)
-        return np.where(explore, anything, greedy(self.agent.q, s))  # (L,) line 8
+        fleet.reset(fleet.landed, rng.integers(TRAIN_END, size=len(fleet.landed)))  # 4, 5
+        s = fleet.observations  # (L, 4, 84, 84) 6
+        explore = rng.random(c.num_envs) < epsilon  # (L,) 7
+        anything = rng.integers(world.actions, size=c.num_envs)  # (L,)
+        a = np.where(explore, anything, greedy(agent.q, s))  # (L,) 8
+        s2, r, terminated, truncated, infos = fleet.step(a)  # 9, 10
+        r = learner_reward(r, infos, rc, c.gamma)  # (L,) [+forward_reward] and the two values
+        end = np.where(terminated, dqn.TERMINAL, dqn.TRUNCATED * truncated)  # (L,)
+        replay.add(s, a, r, s2, end)  # 11
 
-    def advance(self, a: ndarray) -> Flights:
-        """Fly actions a (L,) and remember what came of them, each metre ahead paid for in the
-        target alone; returns the flights that ended."""
-        s, x = np.stack([env.observation for env in self.envs]), self.x()  # (L, 4, 84, 84), (L,)
-        steps = [env.step(action) for env, action in zip(self.envs, a.tolist(), strict=True)]
-        s2, r, *_ = zip(*steps, strict=True)  # lines 9, 10
-        end = [END.get(env.edge or env.outcome, dqn.DEAD) for env in self.envs]
-        self.memory.add(s, a, r + self.c.ahead * (self.x() - x), s2, end)  # line 11
-        landed = {lane: env.flight() for lane, env in enumerate(self.envs) if env.outcome}
-        for lane in landed:
-            self.take_off(lane)
-        return list(landed.values())
+        for _ in range(run.due(c.update_every) if step >= c.learning_starts else 0):
+            batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
+            batch = mirror(batch, world.actions, rng) if c.mirror else batch  # [+mirror]
+            s, a, r, s2, discount, end = map(torch.from_numpy, batch)  # the shapes of Batch
+            with torch.no_grad():
+                q2 = agent.q_target(s2, agent.bfloat16)  # (B, A)
+                # [+double] The maximum of noisy values is too high, so the other network chooses.
+                q2_online = agent.q(s2, agent.bfloat16) if c.double else q2  # (B, A)
+                y = td_target(r, discount, end, q2, q2_online)  # (B,) 13
+            q = agent.q(s, agent.bfloat16).gather(1, a[:, None])[:, 0]  # (B,)
+            agent.loss = torch.nn.functional.smooth_l1_loss(q, y, beta=delta)  # 14
+            agent.optimizer.zero_grad()
+            agent.loss.backward()
+            if c.max_grad_norm:  # [+max_grad_norm] One strange batch must not throw Q off.
+                torch.nn.utils.clip_grad_norm_(agent.q.parameters(), c.max_grad_norm)
+            agent.optimizer.step()
+            agent.updates += 1
+            if agent.updates % c.target_every == 0:
+                agent.q_target.load_state_dict(agent.q.state_dict())  # 15
+            if run.last_share:  # [+average] A mean of weights moves less than its parts.
+                agent.mean.update_parameters(agent.q)
 
-    def x(self) -> ndarray:
-        """How far along the forest each drone is, (L,) m."""
-        return np.array([env.drone.position.x for env in self.envs])
-
-    def test(self, row: dict[str, float]) -> dict[str, float]:
-        """Fly the test forests greedily, log it, and keep the best weights, or the mean of the
-        last ones, whatever it scores, for a best score is lucky; returns the log row."""
-        book, log = self.book, self.book["log"]
-        late = self.c.average > 0 and row["step"] > (1 - self.c.average) * self.c.steps
-        q = self.agent.q_target if late else self.agent.q
-        flights = measure(fly("dqn", dqn_pilot(q), self.test_seeds, self.world))
-        row |= {f"test_{key}": float(values.mean()) for key, values in flights.items()}
-        log.append(row | {"test_over_random": row["test_steps"] / book["bar"] - 1})
-        book["timing"].append({"step": book["step"], "seconds": round(book["seconds"], 1)})
-        for name in ("log", "timing"):
-            write_csv(self.folder / f"{name}.csv", book[name])
-        score = [row["test_goal" if self.c.beacon else "test_crossed"], row["test_progress"]]
-        if late or score > book["best"]:
-            book["best"] = score
-            save_weights(self.folder / "best.pt", q, self.c.beacon)
-        return log[-1]
-
-    def record(self) -> list[list[tuple[int, str]]]:
-        """Of every lane, the seed and actions of each flight that has a frame in the replay."""
-        for lane in self.flights:
-            while sum(len(actions) for _, actions in lane[1:]) >= self.memory.rows:
-                lane.pop(0)
-        return [[(seed, "".join(map(str, a))) for seed, a in lane] for lane in self.flights]
-
-    def save(self) -> None:
-        """Write the checkpoint: 27 MB, and about one byte for each step in the replay."""
-        content = {"config": asdict(self.c), "book": self.book, "added": self.memory.added}
-        content |= {"flights": self.record(), "agent": self.agent.state_dict()}
-        content |= {"optimizer": self.agent.optimizer.state_dict(), "updates": self.agent.updates}
-        content |= {"rngs": [r.bit_generator.state for r in (self.fly_rng, self.learn_rng)]}
-        save(self.folder / CHECKPOINT, "checkpoint", content)
-
-    def restore(self, saved: dict) -> None:
-        """Take up a saved training: fly its replay again, then set everything else as it was."""
-        rows = min(saved["added"], self.memory.rows)
-        self.memory.added = saved["added"] - rows
-        self.plans = [iter([seed for seed, _ in lane]) for lane in saved["flights"]]
-        digits = ["".join(actions for _, actions in lane) for lane in saved["flights"]]
-        for lane, env in enumerate(self.envs):
-            self.take_off(lane)
-            for a in digits[lane][:-rows]:  # frames that were overwritten already
-                env.step(int(a))
-        for row in range(-rows, 0):
-            show(f"flying the replay again: {row * -len(digits):,} steps to go")
-            self.advance(np.array([int(actions[row]) for actions in digits]))
-        if self.record() != saved["flights"]:
-            raise ValueError(f"{self.folder}: its flights fly otherwise here; another machine?")
-        self.book, self.agent.updates = saved["book"], saved["updates"]
-        self.agent.load_state_dict(saved["agent"])
-        self.agent.optimizer.load_state_dict(saved["optimizer"])
-        for rng, state in zip((self.fly_rng, self.learn_rng), saved["rngs"], strict=True):
-            rng.bit_generator.state = state
-
-
-def train(run: Training) -> int:
-    """Algorithm 1 of [Mnih15], over c.lanes forests at once; its line numbers are in dqn.py.
-
-    Returns the exit code: 0, or 128 and the signal that interrupted it.
-    """
-    c = run.c
-    write_whole(run.folder / "config.json", json.dumps(vars(c), indent=2).encode())
-    if "bar" not in run.book:  # mean flight time of the random pilot, in steps
-        bar = fly_random(run.test_seeds, run.world, run.bar_rng)
-        run.book["bar"] = float(measure(bar)["steps"].mean())
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, run.stop)
-    print(f"to {run.folder}; its best.pt holds the best weights so far, at last their mean\n")
-    print("".join(f"{head:>{len(format(0, form))}}" for head, form in COLUMNS.values()), flush=True)
-    start = time.perf_counter() - run.book["seconds"]
-    while run.book["step"] < c.steps and not run.stopped:
-        row = run.step()
-        step, seconds = row["step"], time.perf_counter() - start
-        speed = {"speed": step / seconds, "eta": max(c.steps - step, 0) * seconds / step / 60}
-        show(status(row | speed))
-        if times_due(step, c.lanes, c.test_every) or step >= c.steps:
-            print(status(run.test(row) | speed), flush=True)
-        run.book["seconds"] = time.perf_counter() - start
-        if times_due(step, c.lanes, c.checkpoint_every) or step >= c.steps or run.stopped:
+        run.note()
+        if run.due(rc.test_every) or step >= c.steps:
+            run.test(epsilon)
             run.save()
-    if run.book["step"] >= c.steps:
-        return 0
-    again = [sys.orig_argv[0], sys.argv[0], "train", "--resume", str(run.folder)]
-    print(f"\nsaved at step {run.book['step']:,}; to go on:\n{shlex.join(again)}")
-    return 128 + run.stopped
-
-
-def times_due(step: int, stride: int, every: int) -> int:
-    """How often a thing done every so many steps falls due in the last stride of them.
-
-    >>> times_due(16, 8, 4), times_due(16, 8, 10), times_due(24, 8, 10)
-    (2, 1, 1)
-    """
-    return step // every - (step - stride) // every
-
-
-def status(row: dict) -> str:
-    """One line of a training: the columns that the row has."""
-    return "".join(format(row[key], form) for key, (_, form) in COLUMNS.items() if key in row)
-
-
-def show(text: str) -> None:
-    """Show a passing status on a terminal; nothing when piped."""
-    if sys.stdout.isatty():
-        print(f"\r{text}\x1b[K\r", end="", flush=True)
-
-
-def write_csv(path: Path, rows: Sequence[dict]) -> None:
-    """One line of numbers a row, under a line of names."""
-    lines = (rows[0], *(row.values() for row in rows))
-    write_whole(path, "".join(",".join(map(str, line)) + "\n" for line in lines).encode())
-
-
-def save_weights(path: Path, q: QNetwork, beacon: bool) -> None:
-    """Half precision, 3.4 MB, and the world they were trained in."""
-    half = {name: value.half().cpu() for name, value in q.state_dict().items()}
-    save(path, "weights", {"beacon": beacon, "network": half})
-
-
-def load_weights(path: Path, beacon: bool) -> QNetwork:
-    """Read what save_weights wrote. Raises ValueError."""
-    saved, q = load(path, "weights"), QNetwork(World.actions)
-    for name, needed in q.state_dict().items():
-        shape = tuple(saved["network"].get(name, torch.empty(0)).shape)
-        if shape != needed.shape:
-            raise ValueError(f"{path}: {name} is {shape}, the network needs {tuple(needed.shape)}")
-    if saved["beacon"] != beacon:
-        raise ValueError(f"{path} was trained with{'' if saved['beacon'] else 'out'} the beacon")
-    q.load_state_dict(saved["network"])
-    return q
+    return run.finish()
 
 
 # -------------------------------------------------- eval
 
-ROWS = {  # the table: figure -> label, factor, digits
-    "seconds": ("flight time, s", 1, 2), "steps": ("flight time, steps", 1, 1),
-    "over_random": ("over random, %", 100, 0), "crossed": ("crossed, %", 100, 1),
-    "progress": ("progress, m", 1, 1), "crash": ("crashed, %", 100, 1),
-    "goal": ("arrived, %", 100, 1), "left": ("left the forest, %", 100, 1),
-    "time": ("out of time, %", 100, 1), "return": ("return", 1, 1),
-}  # fmt: skip
+
+def dqn_pilot(q: QNetwork) -> Pilot:
+    """The greedy policy of a Q-network: four pictures and nothing else."""
+    return lambda fleet: greedy(q, fleet.observations)
 
 
 def evaluate(args: argparse.Namespace) -> int:
     """Fly every pilot through the same forests; print the table, write pictures and JSON."""
-    torch.set_num_threads(Config.threads)
+    if args.episodes < 1 or args.first_seed < 0:
+        raise ValueError(f"episodes {args.episodes} < 1 or first-seed {args.first_seed} < 0")
+    if args.json and (args.json.is_dir() or not args.json.absolute().parent.is_dir()):
+        raise ValueError(f"{args.json} cannot be written: it needs an existing folder")
+    shipped = Path(__file__).parent / "weights" / ("beacon.pt" if args.beacon else "paper.pt")
+    q = dqn.load_weights(args.weights or shipped, World.actions, beacon=args.beacon)
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"out is {args.out}, allowed is a folder: {error}") from None
+    torch.set_num_threads(RunConfig.threads)
     world, rng = World(beacon=args.beacon), np.random.default_rng(0)
     seeds = range(args.first_seed, args.first_seed + args.episodes)
-    pilots = {"straight": straight_pilot, "laser": laser_pilot, "dqn": dqn_pilot(args.q)}
+    pilots = {"straight": env.straight_pilot, "laser": env.laser_pilot, "dqn": dqn_pilot(q)}
     bar = fly_random(seeds, world, rng)
-    flights = {p: bar if p == "random" else fly(p, pilots[p], seeds, world) for p in args.pilots}
+    flights = {p: bar if p == "random" else fly(pilots[p], seeds, world) for p in args.pilots}
     figures = {p: summarize(flights[p], bar, len(seeds), rng) for p in flights}
-    print(f"{len(seeds)} forests from seed {seeds[0]}; the random pilot flies {len(bar):,} times\n")
+    print(f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in brackets\n")
     print_table(figures)
-    draw_pictures(flights, seeds, world, args.out)
     if args.json:
-        head = dict(weights=str(args.weights), beacon=args.beacon, first_seed=seeds[0])
-        report = {p: figures[p] | {"flights": flights[p]} for p in flights}
-        write_whole(args.json, json.dumps(head | dict(forests=len(seeds), pilots=report)).encode())
+        report = {"weights": str(args.weights or shipped), "beacon": args.beacon}
+        report |= {"first_seed": seeds[0], "forests": len(seeds)}
+        report["pilots"] = {p: figures[p] | {"flights": flights[p]} for p in flights}
+        dqn.write_whole(args.json, json.dumps(report).encode())
+    best = int(measure(flights[args.pilots[-1]])["crossed"].argmax())  # the first to cross, or 0
+    pictures = film({p: flights[p][best] for p in flights}, world, q)
+    render.save_film(args.out / "flight.gif", pictures, round(1000 * world.dt))
+    print(f"\nwrote {args.out / 'flight.gif'}: forest {seeds[best]}, pilot {args.pilots[-1]}")
     return 0
 
 
-def summarize(flights: Flights, bar: Flights, forests: int, rng: np.random.Generator) -> dict:
+def summarize(flights: Flights, bar: Flights, forests: int, rng: Generator) -> dict[str, dict]:
     """Every figure with its 95 % interval: value, low, high.
 
-    Means are bootstrapped over forests, for flights through one forest are no independent draws;
-    shares have Wilson's interval, which takes flights as independent: one flight a forest is.
+    Means are bootstrapped over forests, because flights through one forest are no independent
+    draws. Shares have Wilson's interval, which takes flights as independent: one a forest is.
     """
-    # Flights through one forest stand as far apart as there are forests: (F,) means.
+    # Flights through one forest stand as far apart as there are forests: (forests,) means.
     table, random_steps = measure(flights), measure(bar)["steps"].reshape(-1, forests).mean(0)
-    draws = rng.integers(forests, size=(2000, forests))  # (2000, F) resampled forests
+    draws = rng.integers(forests, size=(2000, forests))  # (2000, forests) resampled
     means = {k: table[k].reshape(-1, forests).mean(0) for k in ("steps", "progress", "return")}
     figures = {key: interval(x.mean(), x[draws].mean(1)) for key, x in means.items()}
     ratios = means["steps"][draws].mean(1) / random_steps[draws].mean(1)
     figures["over_random"] = interval(means["steps"].mean() / random_steps.mean() - 1, ratios - 1)
-    figures["seconds"] = {k: v * World.dt for k, v in figures["steps"].items()}
-    for key in ("crossed", *OUTCOMES):
-        figures[key] = wilson(int(table[key].sum()), len(flights))
-    return figures
+    shares = {key: wilson(int(table[key].sum()), len(flights)) for key in ("crossed", *OUTCOMES)}
+    return figures | shares
 
 
 def interval(value: float, resampled: ndarray) -> dict[str, float]:
@@ -490,37 +243,176 @@ def wilson(hits: int, n: int) -> dict[str, float]:
     return {"value": p, "low": max(middle - half, 0.0), "high": min(middle + half, 1.0)}
 
 
+ROWS = {  # the table: figure -> label, factor, digits
+    "steps": ("steps", 1, 0), "over_random": ("vs random, %", 100, 0),
+    "crossed": ("crossed, %", 100, 0), "crash": ("crashed, %", 100, 0),
+    "goal": ("arrived, %", 100, 0), "return": ("return", 1, 0),
+}  # fmt: skip
+
+
 def print_table(figures: dict[str, dict]) -> None:
-    """One row a figure, one column a pilot, 95 % intervals in brackets."""
-    print(f"{'':20}" + "".join(f"{name:>26}" for name in figures))
+    """One row a figure, one column a pilot."""
+    print(f"{'':12}" + "".join(f"{name:>17}" for name in figures))
     for key, (label, factor, digits) in ROWS.items():
         cells = [[f"{factor * x:.{digits}f}" for x in p[key].values()] for p in figures.values()]
-        print(f"{label:20}" + "".join(f"{f'{x} [{low}, {high}]':>26}" for x, low, high in cells))
+        print(f"{label:12}" + "".join(f"{f'{x} [{low}, {high}]':>17}" for x, low, high in cells))
 
 
-def draw_pictures(flights: dict[str, Flights], seeds: range, world: World, out: Path) -> None:
-    """Draw every pilot in the first three forests, and film the last pilot in the first."""
-    size, maps = (world.length, world.width), []
-    for i, seed in enumerate(seeds[:3]):
-        tracks = [(*track(f[i], world), name) for name, f in flights.items()]
-        maps.append(render.draw_map(plant(seed, world), size, tracks, f"forest {seed}"))
-    render.Image.fromarray(np.vstack(maps)).save(out / "flights.png")
-    shown = list(flights.values())[-1][0]
-    trunks, title, (path, ended) = plant(seeds[0], world), f"forest {seeds[0]}", track(shown, world)
-    growing = [(path[:t], "", "") for t in range(1, len(path))] + [(path, ended, "")]
-    maps = [render.draw_map(trunks, size, [part], title) for part in growing]
-    frames = [step[0][-1] for step in refly(shown["seed"], shown["actions"], world)]
-    render.save_film(out / "flight.gif", frames, maps, round(1000 * world.dt))
-    print(f"\nwrote {out / 'flights.png'} and {out / 'flight.gif'}")
+@torch.no_grad()
+def film(flown: dict[str, dict], world: World, q: QNetwork) -> Iterator[render.Image.Image]:
+    """The pictures of the last pilot's flight: what it sees, Q, the map with all pilots' ways."""
+    *others, (name, flight) = flown.items()
+    trunks, title = env.plant(flight["seed"], world), f"forest {flight['seed']}"
+    chart = render.draw_map(trunks, (world.length, world.width), title)
+    chart = render.draw_ways(chart, [(*track(f, world), pilot) for pilot, f in others])
+    (path, end), total = track(flight, world), 0.0
+    for t, (s, r, *_, info) in enumerate(refly(flight["seed"], flight["actions"], world)):
+        total += r
+        action, ended = (int(flight["actions"][t]), "") if t < flight["steps"] else (-1, end)
+        if t % (1 + flight["steps"] // 300) and not ended:
+            continue  # of a long flight not every step is filmed
+        seen = render.draw_ways(chart, [(path[: t + 1], ended, name)])
+        values = q(torch.from_numpy(s)[None])[0].numpy() if name == "dqn" else None  # (A,)
+        clock = f"{t * world.dt:.1f} s, {info['d_goal']:.1f} m to the goal"
+        lines = (f"{name}: {clock}", f"return {total:.1f}", render.ENDS[ended])
+        panel = render.draw_panel(s[-1], seen, values, action, lines)
+        yield panel
+    yield from [panel] * 20  # the end stays for two seconds
 
 
-def track(flight: dict, world: World) -> tuple[ndarray, str]:
-    """Where a flight went (T + 1, 2) in m, by flying it again, and its edge or outcome."""
+def track(flight: dict[str, Any], world: World) -> tuple[ndarray, str]:
+    """Where a flight went (T, 2) in m, by flying it again, and its edge or outcome."""
     steps = refly(flight["seed"], flight["actions"], world, camera=False)
     return np.array([info["pose"][:2] for *_, info in steps]), flight["edge"] or flight["outcome"]
 
 
-# -------------------------------------------------- command line
+# -------------------------------------------------- plumbing: skip it on a first reading
+
+HEAD = "     step   eps steps/s min left return | test: return over random crossed crash"
+ROW = "{step:9,}{epsilon:6.2f}{speed:8.0f}{eta:9.1f}{train_return:7.1f}{test_return:15.1f}"
+ROW += "{test_over_random:12.0%}{test_crossed:8.0%}{test_crash:6.0%}"
+
+
+class Run:
+    """What a training asks of the machine: a folder, a log, a clock, a checkpoint, Ctrl-C."""
+
+    def __init__(self, folder: Path, c: DQNConfig, rc: RunConfig, parts: Any, saved: Any) -> None:
+        """Take hold of the folder, and begin there or go on where the checkpoint stands."""
+        torch.set_flush_denormal(True)  # else RMSprop's dead moments, below 1e-38, halve the speed
+        torch.set_num_threads(rc.threads)
+        self.folder, self.c, self.rc, self.stopped = folder, c, rc, 0
+        self.agent, self.replay, self.fleet, self.rng = parts
+        self.book = {"step": 0, "episodes": 0, "seconds": 0.0, "recent": [], "log": [], "best": []}
+        folder.mkdir(parents=True, exist_ok=True)
+        self.lock = dqn.lock_folder(folder)
+        self.handlers = {n: signal.signal(n, self.stop) for n in (signal.SIGINT, signal.SIGTERM)}
+        if saved:
+            self.restore(saved)
+        else:
+            bar = fly_random(TESTS, self.fleet.world, np.random.default_rng(0))
+            self.book["bar"] = measure(bar)["steps"].mean().item()  # steps that random flies
+        self.save()
+        settings = json.dumps(asdict(c) | asdict(rc), indent=2)
+        dqn.write_whole(folder / "config.json", settings.encode())
+        print(f"to {folder}; its best.pt holds the best weights so far, at last their mean\n")
+        print(HEAD, flush=True)
+        self.started = time.perf_counter() - self.book["seconds"]
+
+    def steps(self) -> Iterator[int]:
+        """The numbers of the control steps to come, until the last or a signal."""
+        while self.book["step"] < self.c.steps and not self.stopped:
+            self.book["step"] += self.c.num_envs
+            yield self.book["step"]
+
+    def stop(self, number: int, _frame: object) -> None:
+        """A first Ctrl-C or SIGTERM lets the step end and saves; a second stops at once."""
+        if self.stopped:
+            raise KeyboardInterrupt
+        self.stopped = number
+
+    @property
+    def last_share(self) -> bool:
+        """Whether this is one of the last steps, in which the mean of Q's weights is taken."""
+        return self.c.average > 0 and self.book["step"] > (1 - self.c.average) * self.c.steps
+
+    def due(self, every: int) -> int:
+        """How often a thing done every so many control steps falls due on this one."""
+        return self.book["step"] // every - (self.book["step"] - self.c.num_envs) // every
+
+    def note(self) -> None:
+        """Count the flights that have landed, and show a passing status."""
+        book, landed = self.book, [self.fleet.envs[lane].flight() for lane in self.fleet.landed]
+        book["episodes"] += len(landed)
+        book["recent"] = (book["recent"] + landed)[-100:]
+        book["seconds"] = time.perf_counter() - self.started
+        if not self.agent.loss.isfinite():
+            why = f"the loss is {self.agent.loss.item()} at step {book['step']:,}: is lr too high?"
+            raise FloatingPointError(f"{why} Last good: {self.folder / 'checkpoint.pt'}")
+        speed = book["step"] / book["seconds"]
+        self.clock = {"speed": speed, "eta": max(self.c.steps - book["step"], 0) / speed / 60}
+        show("step {}: {speed:.0f} a second, {eta:.1f} min left".format(book["step"], **self.clock))
+
+    def test(self, epsilon: float) -> None:
+        """Fly the test forests greedily, log it, and keep the best weights, or the mean of the last
+        ones, whatever it scores, because a best score is lucky."""
+        book, late = self.book, self.last_share and self.agent.mean.n_averaged > 0
+        q = self.agent.mean.module if late else self.agent.q
+        row = {"step": book["step"], "episodes": book["episodes"], "updates": self.agent.updates}
+        row["epsilon"] = epsilon
+        flown = {"train": book["recent"], "test": fly(dqn_pilot(q), TESTS, self.fleet.world)}
+        for who, flights in flown.items():
+            row |= {f"{who}_{key}": x.mean().item() for key, x in measure(flights).items()}
+        row["test_over_random"] = row["test_steps"] / book["bar"] - 1
+        book["log"].append(row)
+        lines = [",".join(map(str, line)) for line in (row, *(x.values() for x in book["log"]))]
+        dqn.write_whole(self.folder / "log.csv", "\n".join([*lines, ""]).encode())
+        score = [row["test_goal" if self.rc.beacon else "test_crossed"], row["test_progress"]]
+        if late or score > book["best"]:
+            book["best"] = score
+            dqn.save_weights(self.folder / "best.pt", q, beacon=self.rc.beacon)
+        print(ROW.format(**row | self.clock), flush=True)
+
+    def save(self) -> None:
+        """Write the checkpoint: 34 MB, and of the replay one byte a step and each flight's seed."""
+        content = {"settings": asdict(self.c) | asdict(self.rc), "machine": dqn.MACHINE}
+        content |= {"agent": self.agent.state_dict(), "rng": self.rng.bit_generator.state}
+        content |= {"added": self.replay.added, "flights": self.fleet.record(self.replay.rows)}
+        dqn.save(self.folder / "checkpoint.pt", "checkpoint", content | {"book": self.book})
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Fly the saved replay again, then set everything else as it was."""
+        replay, fleet, rows = self.replay, self.fleet, min(saved["added"], self.replay.rows)
+        replay.added = saved["added"] - rows
+        seeds = [iter([seed for seed, _ in lane]) for lane in saved["flights"]]
+        digits = ["".join(actions for _, actions in lane) for lane in saved["flights"]]
+        for lane, actions in enumerate(digits if rows else ()):
+            fleet.reset([lane], [next(seeds[lane])])
+            for a in actions[:-rows]:  # their pictures were overwritten already
+                fleet.envs[lane].step(int(a))
+        for row in range(-rows, 0):
+            show(f"flying the replay again: {-row * len(digits):,} steps to go")
+            fleet.reset(fleet.landed, [next(seeds[lane], 0) for lane in fleet.landed])
+            s, a = fleet.observations, np.array([int(actions[row]) for actions in digits])
+            s2, r, terminated, truncated, infos = fleet.step(a)
+            r = learner_reward(r, infos, self.rc, self.c.gamma)
+            replay.add(s, a, r, s2, np.where(terminated, dqn.TERMINAL, dqn.TRUNCATED * truncated))
+        if fleet.record(replay.rows) != saved["flights"]:
+            raise ValueError(f"{self.folder}: its flights fly otherwise here; another machine?")
+        self.book, self.rng.bit_generator.state = saved["book"], saved["rng"]
+        self.agent.load_state_dict(saved["agent"])
+        if not self.last_share:  # a longer training takes the mean of its own last share
+            self.agent.mean.n_averaged.zero_()
+
+    def finish(self) -> int:
+        """The exit code: 0; or, saved and with the command that goes on, 128 and the signal."""
+        for number, handler in self.handlers.items():
+            signal.signal(number, handler)
+        if self.book["step"] >= self.c.steps:
+            return 0
+        self.save()
+        again = [sys.orig_argv[0], sys.argv[0], "train", "--resume", str(self.folder)]
+        print(f"\nsaved at step {self.book['step']:,}; to go on:\n{shlex.join(again)}")
+        return 128 + self.stopped
 
 
 class Parser(argparse.ArgumentParser):
@@ -532,18 +424,20 @@ class Parser(argparse.ArgumentParser):
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Read the command line; every field of Config is a flag of `train`."""
+    """Read the command line; every setting is a flag of `train`."""
     parser = Parser(prog="deepflight.py", description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
     sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
-    sub.add_argument("--preset", choices=("default", "mnih"), default="default")
+    sub.set_defaults(run=start_training, preset="default", name="", resume=None)
+    sub.add_argument("--preset", choices=("default", "mnih"))
     which = sub.add_mutually_exclusive_group()
-    which.add_argument("--name", default="", help="of the folder in runs/; else a fresh number")
-    which.add_argument("--resume", type=Path, default=None, help="the folder to go on in")
-    for f in fields(Config):
+    which.add_argument("--name", help="of the folder in runs/; else a fresh number")
+    which.add_argument("--resume", type=Path, help="the folder to go on in")
+    for f in SETTINGS:
         kind = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type}
         sub.add_argument("--" + f.name.replace("_", "-"), help=f.metadata["help"], **kind)
     sub = commands.add_parser("eval", help="fly trained weights against three other pilots")
+    sub.set_defaults(run=evaluate)
     names = ("random", "straight", "laser", "dqn")
     sub.add_argument("--weights", type=Path, help="default: weights/paper.pt or weights/beacon.pt")
     sub.add_argument("--pilots", nargs="+", choices=names, default=names, help="which to show")
@@ -555,80 +449,47 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def prepare_train(args: argparse.Namespace) -> Callable[[], int]:
-    """Check everything and make or reopen the run's folder."""
-    given = {f.name: getattr(args, f.name) for f in fields(Config) if hasattr(args, f.name)}
-    preset = MNIH if args.preset == "mnih" else {}
+def start_training(args: argparse.Namespace) -> int:
+    """Check all that is given before anything is written, then train."""
+    given = {f.name: vars(args)[f.name] for f in SETTINGS if f.name in args}
     if args.resume:
-        saved = load(args.resume / CHECKPOINT, "checkpoint")
-        given = preset | {"steps": saved["config"]["steps"]} | given  # a preset lengthens nothing
-        run = Training(agreed(saved, given, args.resume), args.resume)
-        run.lock = lock_folder(args.resume)
-        run.restore(saved)
-        return lambda: train(run)
-    c = Config(**(BEACON if given.get("beacon") else {}) | preset | given)
-    if c.device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("device is 'cuda', but torch finds none here: use cpu")
+        saved = dqn.load(args.resume / "checkpoint.pt", "checkpoint")
+        if given.keys() - {"steps"} or args.preset != "default":
+            raise ValueError(f"{args.resume} keeps its own settings: give none but --steps")
+        if saved["machine"] != dqn.MACHINE:
+            raise ValueError(f"{args.resume} is of {saved['machine']}, here is {dqn.MACHINE}")
+        c, rc = configure(saved["settings"] | given)
+        if (flown := saved["book"]["step"]) >= c.steps:
+            raise ValueError(f"{args.resume} has flown {flown:,} steps: give more by --steps")
+        return train(c, rc, args.resume, saved)
+    preset = (BEACON if given.get("beacon") else {}) | (MNIH if args.preset == "mnih" else {})
     numbers = (Path(f"runs/{i:03d}") for i in range(1, 10**6))
     folder = Path("runs") / args.name if args.name else next(p for p in numbers if not p.exists())
     if folder.parent != Path("runs") or folder.name == ".." or folder.exists():
         raise ValueError(f"name is {args.name!r}, allowed is that of a new folder in runs/")
-    run = Training(c, folder)  # before the folder is made, for memory may not suffice
-    folder.mkdir(parents=True)
-    run.lock = lock_folder(folder)
-    run.begin()
-    return lambda: train(run)
+    return train(*configure(preset | given), folder)
 
 
-def agreed(saved: dict, given: dict[str, Any], folder: Path) -> Config:
-    """The settings of a checkpoint, if nothing that is given now contradicts them. Only the number
-    of steps may change; the learning rate is then that of the new number."""
-    c, was = Config(**saved["config"] | given), saved["config"]
-    other = [k for k, x in vars(c).items() if x != was.get(k) and k != "steps"]
-    differ = ", ".join(f"{k} {getattr(c, k)}, was {was.get(k)}" for k in other)
-    if differ:
-        raise ValueError(f"{folder} has other settings: {differ}; leave them out or begin anew")
-    if (flown := saved["book"]["step"]) >= c.steps:
-        raise ValueError(f"{folder} has flown {flown:,} steps: give more by --steps")
-    return c
-
-
-def lock_folder(folder: Path) -> sqlite3.Connection:
-    """Keep a second training out as long as what this returns is held, however it is let go.
-
-    SQLite's lock is the one in the standard library that works everywhere and dies with its owner.
-    """
-    try:
-        lock = sqlite3.connect(folder / "lock", timeout=0, isolation_level=None)
-        lock.execute("BEGIN EXCLUSIVE")
-    except sqlite3.Error as error:
-        raise ValueError(f"{folder} is another training's, or cannot be held: {error}") from None
-    return lock
-
-
-def prepare_eval(args: argparse.Namespace) -> Callable[[], int]:
-    """Check everything and read the weights, before anything flies."""
-    if args.episodes < 1 or args.first_seed < 0:
-        raise ValueError(f"episodes {args.episodes} < 1 or first-seed {args.first_seed} < 0")
-    if args.json and (args.json.is_dir() or not args.json.absolute().parent.is_dir()):
-        raise ValueError(f"{args.json} cannot be written: it needs an existing folder")
-    shipped = Path(__file__).parent / "weights" / ("beacon.pt" if args.beacon else "paper.pt")
-    args.weights = args.weights or shipped
-    args.q = load_weights(args.weights, args.beacon) if "dqn" in args.pilots else None
-    args.out.mkdir(parents=True, exist_ok=True)
-    return lambda: evaluate(args)
+def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
+    """Both kinds of settings; ValueError names what is wrong."""
+    c = DQNConfig(**{key: value for key, value in given.items() if hasattr(DQNConfig, key)})
+    rc = RunConfig(**{key: value for key, value in given.items() if hasattr(RunConfig, key)})
+    for settings in (c, rc):
+        env.check_numbers(settings, {f.name: f.metadata["legal"] for f in fields(settings)})
+    # The least: three rows to complete a stack, n_steps that wait for rewards, one to draw.
+    if min(c.replay_size, c.learning_starts) < (least := c.num_envs * (c.n_steps + 4)):
+        raise ValueError(f"replay_size, learning_starts: one is below the least, {least}")
+    return c, rc
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; what goes wrong is one line: bad input exit code 2, trouble on the way 1."""
-    args, code, trouble = parse(argv), 2, (ValueError, OSError, MemoryError)
+    args = parse(argv)
     try:
-        job = (prepare_train if args.command == "train" else prepare_eval)(args)
-        code, trouble = 1, (FloatingPointError, OSError)
-        return job()
-    except trouble as error:
+        return args.run(args)
+    except (ValueError, MemoryError, FloatingPointError, OSError) as error:
         print(f"deepflight.py {args.command}: error: {error}", file=sys.stderr)
-        return code
+        return 1 if isinstance(error, FloatingPointError | OSError) else 2
     except KeyboardInterrupt:
         print("\ninterrupted", file=sys.stderr)
         return 130

@@ -10,6 +10,11 @@
         y = -25  +-----------------------------------------------+
                x = 0    x: start to goal, y: left, heading psi: counter-clockwise from x   x = 90
 
+The drone never slows down. Ten times a second it sees four pictures and picks one of nine yaw
+rates, 0 the sharpest right turn, 4 straight on, 8 the sharpest left turn. Each such step earns one
+number, the reward. It says how good that step was, and nothing else tells the drone what to do: to
+fly well is to collect as much reward as possible over a whole flight.
+
     | every step                      | reward                                     | d_obs        |
     |---------------------------------|--------------------------------------------|--------------|
     | safe                            | r_safe = +0.25                             | > 2.0 m      |
@@ -18,33 +23,47 @@
     | crash, or out at any d_obs      | r_crash = -10 and nothing else; the end    | < 0.75 m     |
     | arrival, or out of time         | as on every live step; the end             | >= 0.75 m    |
 
-pymunk moves the drone and measures d_obs; render.py looks. [DF] is the Deep Flight paper.
-Legend: d_obs is the distance from the drone's centre to the nearest bark, at most the laser's 20 m,
-d_goal that to the goal; SI units. A flight is a deterministic function of its seed and its actions:
-keep those two and you can fly it again, frame by frame (`refly`).
+One step in numbers: the drone is at x = 30 on the middle line, so d_goal = 60, and the nearest bark
+is 1.5 m away. That is too close: -5 * (2.0 - 1.5) / (2.0 - 0.75) = -2. A third of the way is made:
+1 - 60 / 90 = 0.33. The reward of the step is -1.67.
 
-Not in this file: rotors, wind, inertia, altitude. `ForestEnv` has Gymnasium's signatures
-without needing gymnasium.
+A flight ends in one of two ways. It is **terminated** when the world itself ends it: by a crash, by
+arrival, or by leaving the forest. No reward can follow. It is **truncated** when only the clock
+ends it, after 1,000 steps: the drone was still flying, and more reward would have followed. Who
+learns from the flight must not confuse the two.
+
+pymunk moves the drone and measures d_obs; render.py looks. A flight is a deterministic function of
+its seed and its actions: keep those two and you can fly it again, frame by frame (`refly`).
+
+Legend
+    d_obs     m, from the drone's centre to the nearest bark, at most the laser's 20 m
+    d_goal    m, from the drone's centre to the goal
+    d_max     m, the forest's length
+    psi       rad, the heading
+    N         trunks
+    L         drones that fly side by side
+    F         drones that are in the air
+    A         actions
+    [DF]      the Deep Flight paper; "authors' simulator" is the code released with it
+
+Not in this file: rotors, wind, inertia, altitude. `ForestEnv` has Gymnasium's signatures without
+needing gymnasium.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import pymunk
+from numpy import ndarray
 
 from render import PIXELS, Scene, camera, raycast
 
-STACK = 4  # frames in an observation [DF §II-A]
+STACK = 4  # pictures in an observation [DF §II-A]
 OUTCOMES = ("crash", "goal", "left", "time")  # tested in this order
-
-
-# Least and most of a world's numbers that may be other than 0.001 to 10,000. An action is a digit.
-LIMITS = dict.fromkeys(("first_x", "first_y", "r_safe", "r_precrash", "r_crash"), (-1e4, 1e4))
-LIMITS |= dict.fromkeys(("back", "jitter_x", "jitter_y", "beacon_pixels", "yaw_rate"), (0, 1e4))
-LIMITS |= dict.fromkeys(("sky", "ground", "trunk_facing", "trunk_grazing", "beacon_grey"), (0, 255))
-LIMITS |= {"rows": (0, 1e4), "columns": (0, 1e4), "beacon": (0, 1), "actions": (2, 10)}
 
 
 @dataclass(frozen=True)
@@ -78,39 +97,7 @@ class World(Scene):
     beacon: bool = False  # a pole at the goal makes it visible; off in the paper's world
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value, (low, high) = getattr(self, f.name), LIMITS.get(f.name, (1e-3, 1e4))
-            if not (isinstance(value, f.type | int) and low <= value <= high):
-                legal = f"{f.type.__name__} from {low:g} to {high:g}"
-                raise ValueError(f"{f.name} is {value}, allowed: {legal}")
-        # A stride is below reach, or the drone could step over a trunk's middle.
-        reach, spread = self.trunk_radius + self.d_crash, (self.jitter_x, self.jitter_y)  # m
-        nearest = np.hypot(*np.maximum(np.abs(grid(self)) - spread, 0).T).min(initial=math.inf)
-        for small, big, rule in (
-            (self.speed * self.dt, reach, "speed * dt < trunk_radius + d_crash"),
-            (reach, nearest, "trunk_radius + d_crash < the way from the start to any trunk"),
-            (2 * self.d_crash, self.width, "2 * d_crash < width"),
-            (self.d_crash, self.d_neg, "d_crash < d_neg"),
-            (self.d_neg, self.laser_range, "d_neg < laser_range"),
-        ):
-            if not small < big:
-                raise ValueError(f"a legal world has {rule}; here they are {small:g} and {big:g}")
-
-
-def grid(world: World) -> np.ndarray:
-    """Trunk centres (N, 2) in m before jitter."""
-    x = world.first_x + world.spacing_x * np.arange(world.rows)
-    y = world.first_y + world.spacing_y * np.arange(world.columns)
-    return np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)  # (N, 2)
-
-
-def plant(seed: int, world: World) -> np.ndarray:
-    """Trunk centres (N, 2) in m: a jittered grid, a function of the seed alone."""
-    if not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"seed is {seed!r}, allowed are integers from 0")
-    centres = grid(world)  # (N, 2)
-    jitter = (world.jitter_x, world.jitter_y)
-    return centres + np.random.default_rng(seed).uniform(-1, 1, centres.shape) * jitter
+        check_world(self)
 
 
 def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
@@ -133,12 +120,28 @@ def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
     return world.r_precrash * (world.d_neg - d_obs) / (world.d_neg - world.d_crash) + r_goal
 
 
-class ForestEnv:
-    """One drone, one forest, a new one every episode; Gymnasium 1.x signatures.
+def plant(seed: int, world: World) -> ndarray:
+    """Trunk centres (N, 2) in m: a jittered grid, a function of the seed alone."""
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"seed is {seed!r}, allowed are integers from 0")
+    centres = grid(world)  # (N, 2)
+    jitter = (world.jitter_x, world.jitter_y)
+    return centres + np.random.default_rng(seed).uniform(-1, 1, centres.shape) * jitter
 
-    Observation: (4, 84, 84) uint8, oldest frame first, the first frame repeated at reset.
+
+def grid(world: World) -> ndarray:
+    """Trunk centres (N, 2) in m before jitter."""
+    x = world.first_x + world.spacing_x * np.arange(world.rows)
+    y = world.first_y + world.spacing_y * np.arange(world.columns)
+    return np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)  # (N, 2)
+
+
+class ForestEnv:
+    """One drone, one forest, a new one every flight; Gymnasium 1.x signatures.
+
+    Observation: (4, 84, 84) uint8, oldest picture first, the first one repeated at reset.
     Action: an int, 0 turns right at 0.7 rad/s, 4 flies straight, 8 turns left.
-    `camera=False` leaves the frames black, for pilots that look at nothing or at the laser.
+    `camera=False` leaves the pictures black, for pilots that look at nothing or at the laser.
     """
 
     def __init__(self, world: World | None = None, *, camera: bool = True) -> None:
@@ -146,111 +149,117 @@ class ForestEnv:
         self.goal = pymunk.Vec2d(self.world.length, 0.0)  # m, mid of the far edge
         self.space = pymunk.Space()
         ground, radius = self.space.static_body, self.world.trunk_radius
-        self.bark = [pymunk.Circle(ground, radius) for _ in plant(0, self.world)]
+        self.bark = [pymunk.Circle(ground, radius) for _ in grid(self.world)]
         self.drone = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self.space.add(self.drone, *self.bark)
-        self.seed, self.outcome = -1, "not reset"
+        self.seed, self.outcome, self.actions = -1, "not reset", []
 
-    def reset(self, *, seed: int | None = None, options: object = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: object = None) -> tuple[ndarray, dict]:
         """Plant forest number `seed`, or the one after the last, and stand at the start.
 
         Draws nothing from anywhere: the forest is a function of the seed. `options` is unused.
         """
-        self.seed = self.seed + 1 if seed is None else seed
-        self.trunks = plant(self.seed, self.world)  # (N, 2)
+        self.place(self.seed + 1 if seed is None else seed)
+        self.observation = np.repeat(look([self]), STACK, 0)  # (4, 84, 84)
+        return self.observation, self.info()
+
+    def step(self, action: int) -> tuple[ndarray, float, bool, bool, dict]:
+        """Turn at the action's yaw rate, fly one control step, look.
+
+        Returns observation, reward, terminated, truncated, info. info holds d_obs, d_goal and
+        forward (x gained in this step) in m, the pose (x, y, heading), and at the end the outcome,
+        the edge that the drone left by, and the progress.
+        """
+        r = self.fly(action)
+        self.observation = np.concatenate([self.observation[1:], look([self])])  # (4, 84, 84)
+        return self.observation, r, self.terminated, self.truncated, self.info()
+
+    def place(self, seed: int) -> None:
+        """All of a reset but the looking."""
+        self.trunks, self.seed = plant(seed, self.world), seed  # (N, 2)
         for circle, centre in zip(self.bark, self.trunks.tolist(), strict=True):
             circle.unsafe_set_offset(centre)  # a tenth of the time of new circles
         self.space.reindex_static()
-        self.drone.position, self.drone.angle, self.centre = (0.0, 0.0), 0.0, (math.inf, 0.0)
-        self.actions: list[int] = []
-        self.progress, self.total, self.outcome, self.edge = 0.0, 0.0, "", ""
+        self.drone.position, self.drone.angle, self.pose = (0.0, 0.0), 0.0, (0.0, 0.0, 0.0)
+        self.actions, self.progress, self.total = [], 0.0, 0.0
+        self.outcome, self.edge, self.terminated, self.truncated = "", "", False, False
         self._measure()
-        self.observation = np.repeat(self._look()[None], STACK, 0)  # (4, 84, 84)
-        return self.observation, self._info()
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Turn at the action's yaw rate, fly one control step, look.
-
-        Returns observation, reward, terminated, truncated, info. info holds d_obs and d_goal in m,
-        pose (x, y, heading), and at the end the outcome, the edge it left by, and the progress.
-        """
+    def fly(self, action: int) -> float:
+        """All of a step but the looking: turn, fly, measure, judge. Returns the reward."""
         if self.outcome:
             raise ValueError(f"step needs a flight in the air, this one is {self.outcome}: reset")
         if not isinstance(action, int | np.integer) or not 0 <= action < self.world.actions:
             raise ValueError(f"action is {action!r}, allowed are 0 to {self.world.actions - 1}")
         self.actions.append(int(action))
-        self._move(self.world.yaw_rate * (2 * int(action) / (self.world.actions - 1) - 1))
-        self._measure()
-        self.outcome = self._judge()
-        r = reward(self.outcome, self.d_obs, self.d_goal, self.world)
-        self.total += r
-        s2 = self.observation = np.concatenate([self.observation[1:], self._look()[None]])
-        return s2, r, self.outcome not in ("", "time"), self.outcome == "time", self._info()
-
-    def scan(self) -> tuple[np.ndarray, np.ndarray]:
-        """The laser's beams: bearings from the heading (360,) rad, counter-clockwise from dead
-        ahead, and distances (360,) m, 20 where nothing is hit."""
-        bearings = np.arange(self.world.beams) * (2 * math.pi / self.world.beams)  # (360,)
-        offsets = self._around() - self.drone.position  # (K, 2)
-        distance, _ = raycast(offsets, self.world.trunk_radius, bearings + self.drone.angle)
-        return bearings, np.minimum(distance, self.world.laser_range)
-
-    def goal_bearing(self) -> float:
-        """Angle from the heading to the goal, rad in [-pi, pi], positive to the left."""
-        return math.remainder((self.goal - self.drone.position).angle - self.drone.angle, math.tau)
-
-    def flight(self) -> dict:
-        """The flight so far: seed and actions, which are all of it, and what came of them."""
-        digits = "".join(map(str, self.actions))
-        flown = {"seed": self.seed, "actions": digits, "outcome": self.outcome, "edge": self.edge}
-        return flown | {"steps": len(digits), "progress": self.progress, "return": self.total}
-
-    def _move(self, yaw_rate: float) -> None:
-        heading = self.drone.angle + yaw_rate * self.world.dt  # turn first, then fly
+        yaw_rate = self.world.yaw_rate * (2 * int(action) / (self.world.actions - 1) - 1)  # rad/s
+        heading = self.drone.angle + yaw_rate * self.world.dt  # rad: turn first, then fly
         self.drone.velocity = pymunk.Vec2d.from_polar(self.world.speed, heading)
         self.drone.angular_velocity = yaw_rate
         self.space.step(self.world.dt)
-        self.progress = max(self.progress, self.drone.position.x)
+        self._measure()
+        self.outcome = self._judge()
+        self.terminated, self.truncated = self.outcome not in ("", "time"), self.outcome == "time"
+        r = reward(self.outcome, self.d_obs, self.d_goal, self.world)
+        self.total += r
+        return r
 
     def _measure(self) -> None:
-        reach = self.world.laser_range
-        bark = self.space.point_query_nearest(self.drone.position, reach, pymunk.ShapeFilter())
+        before, self.pose = self.pose[0], (*self.drone.position, self.drone.angle)
+        at, reach = self.pose[:2], self.world.laser_range
+        self.forward, self.progress = at[0] - before, max(self.progress, at[0])
+        bark = self.space.point_query_nearest(at, reach, EVERYTHING)
         self.d_obs = bark.distance if bark else reach
-        self.d_goal = math.dist(self.drone.position, self.goal)
+        self.d_goal = math.dist(at, self.goal)
 
     def _judge(self) -> str:
         if self.d_obs < self.world.d_crash:
             return "crash"
         if self.d_goal < self.world.goal_radius:
             return "goal"
-        x, y = self.drone.position
+        x, y, _ = self.pose
         far, back, side = x > self.world.length, x < -self.world.back, abs(y) > self.world.width / 2
         self.edge = "far" if far else "back" if back else "side" if side else ""
         late = len(self.actions) >= self.world.max_steps
         return "left" if self.edge else "time" if late else ""
 
-    def _look(self) -> np.ndarray:
-        if not self.has_camera:
-            return np.zeros((PIXELS, PIXELS), np.uint8)
-        beacon = self.goal if self.world.beacon else None
-        return camera(self.drone.position, self.drone.angle, self._around(), self.world, beacon)
-
-    def _around(self) -> np.ndarray:
-        """Trunks (K, 2) that eye or laser may reach before the next look-up, 5 m from the last: so
-        a step need not look through the whole forest."""
-        if math.dist(self.drone.position, self.centre) > 5:
-            w, self.centre = self.world, self.drone.position
-            view = math.hypot(w.view, w.view + 2 * w.trunk_radius)  # m, to the picture's corner
-            near = 5 + max(view, w.laser_range + w.trunk_radius)  # m
-            self.around = self.trunks[np.hypot(*(self.trunks - self.centre).T) < near]  # (K, 2)
-        return self.around
-
-    def _info(self) -> dict:
-        pose = (*self.drone.position, self.drone.angle)
-        info = {"d_obs": self.d_obs, "d_goal": self.d_goal, "pose": pose}
+    def info(self) -> dict[str, Any]:
+        """Where the drone is, and at the end what became of it."""
+        info = {key: getattr(self, key) for key in ("d_obs", "d_goal", "forward", "pose")}
         if self.outcome:
             info |= {"outcome": self.outcome, "edge": self.edge, "progress": self.progress}
         return info
+
+    def flight(self) -> dict[str, Any]:
+        """The flight so far: seed and actions, which are all of it, and what came of them."""
+        digits = "".join(map(str, self.actions))
+        flown = {"seed": self.seed, "actions": digits, "outcome": self.outcome, "edge": self.edge}
+        return flown | {"steps": len(digits), "progress": self.progress, "return": self.total}
+
+    def scan(self) -> tuple[ndarray, ndarray]:
+        """The laser's beams: bearings from the heading (360,) rad, counter-clockwise from dead
+        ahead, and distances (360,) m, 20 where nothing is hit."""
+        bearings = np.arange(self.world.beams) * (2 * math.pi / self.world.beams)  # (360,)
+        offsets = self.trunks - self.pose[:2]  # (N, 2) m
+        distance, _ = raycast(offsets, self.world.trunk_radius, bearings + self.pose[2])
+        return bearings, np.minimum(distance, self.world.laser_range)
+
+    def goal_bearing(self) -> float:
+        """Angle from the heading to the goal, rad in [-pi, pi], positive to the left."""
+        x, y, heading = self.pose
+        return math.remainder((self.goal - (x, y)).angle - heading, math.tau)
+
+
+EVERYTHING = pymunk.ShapeFilter()
+
+
+def look(envs: Sequence[ForestEnv]) -> ndarray:
+    """What each drone sees, drawn in one call: frames (F, 84, 84) uint8."""
+    world = envs[0].world
+    if not envs[0].has_camera:
+        return np.zeros((len(envs), PIXELS, PIXELS), np.uint8)
+    poses = np.array([env.pose for env in envs])  # (F, 3)
+    return camera(poses, [e.trunks for e in envs], world, envs[0].goal if world.beacon else None)
 
 
 def refly(seed: int, actions: Iterable, world: World, *, camera: bool = True) -> Iterator[tuple]:
@@ -263,3 +272,170 @@ def refly(seed: int, actions: Iterable, world: World, *, camera: bool = True) ->
     yield observation, 0.0, False, False, info
     for action in actions:
         yield env.step(int(action))
+
+
+class Fleet:
+    """L drones that fly side by side, one forest each: a vector environment, in Gymnasium's words.
+
+    One camera call draws what all of them see, which is quicker than a call for each. A drone that
+    has landed waits, and takes no action, until its lane is reset. Each lane keeps a record of its
+    flights, seeds and actions: that is all it takes to fly them again.
+    """
+
+    def __init__(self, world: World, lanes: int, *, camera: bool = True) -> None:
+        self.world, self.envs = world, [ForestEnv(world, camera=camera) for _ in range(lanes)]
+        self.records: list[list[tuple[int, list[int]]]] = [[] for _ in range(lanes)]
+
+    @property
+    def flying(self) -> list[ForestEnv]:
+        """The F drones that are in the air."""
+        return [env for env in self.envs if not env.outcome]
+
+    @property
+    def landed(self) -> list[int]:
+        """The lanes of the others."""
+        return [lane for lane, env in enumerate(self.envs) if env.outcome]
+
+    @property
+    def observations(self) -> ndarray:
+        """What the drones in the air see: (F, 4, 84, 84) uint8."""
+        return np.stack([env.observation for env in self.flying])
+
+    def reset(self, lanes: Sequence[int], seeds: Iterable[int]) -> None:
+        """Begin a flight in these lanes, through the forests of these seeds."""
+        envs = [self.envs[lane] for lane in lanes]
+        for lane, env, seed in zip(lanes, envs, seeds, strict=True):
+            env.place(int(seed))
+            self.records[lane].append((env.seed, env.actions))
+        for env, frame in zip(envs, look(envs) if envs else (), strict=True):
+            env.observation = np.repeat(frame[None], STACK, 0)  # (4, 84, 84)
+
+    def step(self, actions: Iterable[int]) -> tuple[ndarray, ndarray, ndarray, ndarray, list[dict]]:
+        """One control step of the drones in the air; actions: one for each of them, in order.
+
+        Returns their observations (F, 4, 84, 84), rewards (F,), terminated (F,), truncated (F,) and
+        infos, as ForestEnv.step does for one.
+        """
+        envs = self.flying
+        r = [env.fly(a) for env, a in zip(envs, actions, strict=True)]
+        for env, frame in zip(envs, look(envs), strict=True):
+            env.observation = np.concatenate([env.observation[1:], frame[None]])  # (4, 84, 84)
+        s2 = np.stack([env.observation for env in envs])  # (F, 4, 84, 84)
+        terminated, truncated = np.array([(env.terminated, env.truncated) for env in envs]).T
+        return s2, np.array(r), terminated, truncated, [env.info() for env in envs]
+
+    def record(self, steps: int) -> list[list[tuple[int, str]]]:
+        """Of every lane: seed and actions of each flight that has one of the last so many steps."""
+        for flights in self.records:
+            while sum(len(actions) for _, actions in flights[1:]) >= steps:
+                flights.pop(0)
+        return [[(seed, "".join(map(str, a))) for seed, a in lane] for lane in self.records]
+
+
+# -------------------------------------------------- pilots that need no network
+
+Pilot = Callable[[Fleet], Sequence[int]]  # an action for each drone in the air
+Flights = list[dict[str, Any]]  # of ForestEnv.flight
+
+
+def random_pilot(rng: np.random.Generator) -> Pilot:
+    """Every action uniform and independent: the paper's bar."""
+    return lambda fleet: rng.integers(fleet.world.actions, size=len(fleet.flying))
+
+
+def straight_pilot(fleet: Fleet) -> Sequence[int]:
+    """Dead ahead, whatever comes."""
+    return [env.world.actions // 2 for env in fleet.flying]
+
+
+def laser_pilot(fleet: Fleet) -> Sequence[int]:
+    """A dynamic window on the scan and the goal's bearing: a bar for the camera."""
+    return [dynamic_window(*e.scan(), e.goal_bearing(), e.world) for e in fleet.flying]
+
+
+def dynamic_window(bearings: ndarray, distances: ndarray, goal_bearing: float, world: World) -> int:
+    """Simulate 1.5 s of each yaw rate against the scan's points and take the best.
+
+    score = 10 * seconds until the clearance is below 0.8 m + 2 * least clearance (2 m at most)
+            - 4 * heading error to the goal at the arc's end in rad
+    """
+    # In the drone's axes a point is the complex number x + iy.
+    points = (distances * np.exp(1j * bearings))[distances < world.laser_range]  # (P,) m
+    rates = world.yaw_rate * np.linspace(-1, 1, world.actions)  # (A,) rad/s
+    headings = rates[:, None] * world.dt * np.arange(1, 16)  # (A, 15) rad
+    arcs = np.cumsum(world.speed * world.dt * np.exp(1j * headings), 1)  # (A, 15) m
+    clearance = np.abs(arcs[..., None] - points).min(-1, initial=world.laser_range)  # (A, 15) m
+    safe = np.logical_and.accumulate(clearance >= 0.8, 1).sum(1) * world.dt  # (A,) s
+    error = np.abs(np.angle(np.exp(1j * (goal_bearing - headings[:, -1]))))  # (A,) rad, wrapped
+    return int(np.argmax(10 * safe + 2 * np.minimum(clearance.min(1), 2) - 4 * error))
+
+
+def fly(pilot: Pilot, seeds: Sequence[int], world: World, *, camera: bool = True) -> Flights:
+    """Fly one forest a seed, a hundred at once; returns the flights in the order of the seeds."""
+    flights: Flights = []
+    fleet = Fleet(world, min(len(seeds), 100), camera=camera)
+    for group in (seeds[i : i + 100] for i in range(0, len(seeds), 100)):
+        fleet.reset(range(len(group)), group)
+        while flying := fleet.flying:
+            show(f"{len(flights) + len(group) - len(flying):,} of {len(seeds):,} flights landed")
+            fleet.step(pilot(fleet))
+        flights += [env.flight() for env in fleet.envs[: len(group)]]
+    return flights
+
+
+def fly_random(seeds: Sequence[int], world: World, rng: np.random.Generator) -> Flights:
+    """The bar: 2,000 random flights or more, equally many through each forest. A hundred would move
+    the bar itself, the mean flight, by a fifth."""
+    repeats = math.ceil(2000 / len(seeds))
+    return fly(random_pilot(rng), list(seeds) * repeats, world, camera=False)
+
+
+def measure(flights: Flights) -> dict[str, ndarray]:
+    """One number a flight (F,): steps, progress in m, return, and 0 or 1 for how it ended.
+
+    Crossed means arrived at the goal or left by the far edge.
+    """
+    table = {key: np.array([f[key] for f in flights]) for key in ("steps", "progress", "return")}
+    table["crossed"] = np.array([f["outcome"] == "goal" or f["edge"] == "far" for f in flights])
+    return table | {o: np.array([f["outcome"] == o for f in flights]) for o in OUTCOMES}
+
+
+def show(text: str) -> None:
+    """Show a passing status on a terminal; nothing when piped."""
+    if sys.stdout.isatty():
+        print(f"\r{text}\x1b[K\r", end="", flush=True)
+
+
+# -------------------------------------------------- which worlds are legal: skip this
+
+# Least and most of a world's numbers that may be other than 0.001 to 10,000. An action is a digit.
+LIMITS = dict.fromkeys(("first_x", "first_y", "r_safe", "r_precrash", "r_crash"), (-1e4, 1e4))
+LIMITS |= dict.fromkeys(("back", "jitter_x", "jitter_y", "beacon_pixels", "yaw_rate"), (0, 1e4))
+LIMITS |= dict.fromkeys(("sky", "ground", "trunk_facing", "trunk_grazing", "beacon_grey"), (0, 255))
+LIMITS |= {"rows": (0, 1e4), "columns": (0, 1e4), "beacon": (0, 1), "actions": (2, 10)}
+
+
+def check_numbers(settings: Any, limits: dict[str, tuple[float, float]]) -> None:
+    """Raise ValueError if a field of a dataclass is of another type or outside its limits."""
+    for f in fields(settings):
+        value, (low, high) = getattr(settings, f.name), limits.get(f.name, (1e-3, 1e4))
+        if not (isinstance(value, f.type | int) and low <= value <= high):
+            legal = f"{f.type.__name__} from {low:g} to {high:g}"
+            raise ValueError(f"{f.name} is {value}, allowed: {legal}")
+
+
+def check_world(world: World) -> None:
+    """Raise ValueError if no drone could fly in this world by its own rules."""
+    check_numbers(world, LIMITS)
+    # A stride is below reach, or the drone could step over a trunk's middle.
+    reach, spread = world.trunk_radius + world.d_crash, (world.jitter_x, world.jitter_y)  # m
+    nearest = np.hypot(*np.maximum(np.abs(grid(world)) - spread, 0).T).min(initial=math.inf)
+    for small, big, rule in (
+        (world.speed * world.dt, reach, "speed * dt < trunk_radius + d_crash"),
+        (reach, nearest, "trunk_radius + d_crash < the way from the start to any trunk"),
+        (2 * world.d_crash, world.width, "2 * d_crash < width"),
+        (world.d_crash, world.d_neg, "d_crash < d_neg"),
+        (world.d_neg, world.laser_range, "d_neg < laser_range"),
+    ):
+        if not small < big:
+            raise ValueError(f"a legal world has {rule}; here they are {small:g} and {big:g}")

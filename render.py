@@ -1,7 +1,7 @@
-"""render.py: the eyes. A forest of cylinders becomes an 84x84 grey picture, a laser scan, a map.
+"""render.py: the eyes. A forest of upright cylinders becomes a grey picture of 84x84 pixels.
 
-There is no 3D engine here. In a forest of upright cylinders every picture column is one ray in the
-plane, so a camera is 84 rays, a laser scanner is 360 rays, and one closed formula serves both.
+There is no 3D engine here. Every trunk is upright, so each column of the picture is one ray in the
+ground plane. A camera is 84 rays. A laser scanner is 360 rays. One formula serves both.
 
     seen from above                              the same trunk in the picture
 
@@ -14,18 +14,43 @@ plane, so a camera is 84 rays, a laser scanner is 360 rays, and one closed formu
               '-.                                       |   ground  |
                  '-.        bearing -45 deg      row 83 +-----------+
 
-    column i looks along tan(bearing) = (41.5 - i) / 42, positive to the left: a pinhole camera's
-    columns are equally spaced on the picture plane, not in angle.
-    A thing h metres above the eye at depth z shows at row 41.5 - 42 * h / z, where z is measured
-    along the optical axis; the distance along the ray would bend straight walls.
+    The formula: where does a ray meet a trunk?
 
-Legend: N trunks, M rays; metres, radians, grey levels 0 (black) to 255 (white).
-[DF] is the Deep Flight paper, [Mnih15] the Nature paper on DQN.
+                    . - .
+                  /       \\         along       from the eye to the point nearest the centre c
+      eye ------ # --- + - |--->    across      from that point to c, positive to the left
+                 |     |   |        half_chord  from the bark # to that point
+                  \\    c  /         radius      from the bark # to c: the hypotenuse
+                    ' - '
+
+      half_chord = sqrt(radius^2 - across^2)      by Pythagoras, if abs(across) < radius
+      distance   = along - half_chord             from the eye to the bark
+
+    One ray in numbers: a trunk of radius 0.5 m stands 10 m ahead and 0.3 m to the left. The ray
+    that points straight ahead has along = 10 and across = 0.3, so half_chord = 0.4 and the bark is
+    10 - 0.4 = 9.6 m away. The trunk's top is 4 m above the eye and its foot 2 m below. It fills its
+    column from row 41.5 - 42 * 4 / 9.6 = 24.0 down to row 41.5 + 42 * 2 / 9.6 = 50.25.
+
+The two rules of a pinhole camera:
+  * Column i looks along tan(bearing) = (41.5 - i) / 42, positive to the left. Columns are equally
+    spaced on the picture plane, and not in angle.
+  * A point h metres above the eye at depth z shows at row 41.5 - 42 * h / z. Depth is measured
+    along the optical axis. The distance along the ray would bend straight walls.
+
+Legend
+    N  trunks
+    M  rays
+    E  eyes that look at the same time, one for each drone
+    H  hits: pairs of a ray and a trunk that meet
+    x, y       metres; in the drone's own axes x is ahead and y is left
+    bearing    rad, counter-clockwise from the drone's heading
+    grey       0 is black, 255 is white
+    [DF]       the Deep Flight paper, [Mnih15] the Nature paper on DQN
+
 Not in this file: textures, shadows, trunks that lean, a drone that climbs.
 """
 
-import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -34,13 +59,15 @@ import numpy as np
 from numpy import ndarray
 from PIL import Image, ImageDraw
 
-Point = tuple[float, float]  # x, y
+Point = tuple[float, float]  # x, y in m
 
-PIXELS = 84  # height and width of a frame [DF §II-A]
-CENTRE = (PIXELS - 1) / 2  # the optical axis meets the picture between the two middle pixels
+PIXELS = 84  # height and width of a picture [DF §II-A]
+CENTRE = (PIXELS - 1) / 2  # px: the optical axis meets the picture between its two middle pixels
 FOCAL = PIXELS / 2  # px: half the picture spans 45 degrees (the paper is silent: ours)
 SLOPES = (CENTRE - np.arange(PIXELS)) / FOCAL  # (84,) tangents: left to right, and top to bottom
 BEARINGS = np.arctan(SLOPES)  # (84,) rad
+COSINES = np.cos(BEARINGS)  # (84,) depth along the optical axis for each metre along a ray
+ROWS = np.arange(PIXELS, dtype=np.uint8)[:, None]  # (84, 1)
 
 
 @dataclass(frozen=True)
@@ -58,131 +85,178 @@ class Scene:
     ground: int = 60
     trunk_facing: int = 35  # bark seen head-on
     trunk_grazing: int = 0  # bark seen edge-on
-    beacon_grey: int = 140  # clear, but no more: a white pole is shunned like bark
+    beacon_grey: int = 140  # clear, but no more: pilots shun a white pole like bark
 
 
-def raycast(trunks: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray, ndarray]:
-    """Find what each ray from the origin hits first.
+def raycast(
+    trunks: ndarray,
+    radius: ndarray | float,
+    bearings: ndarray,
+    eye: ndarray | int = 0,
+    eyes: int = 1,
+) -> tuple[ndarray, ndarray]:
+    """Find what each ray hits first.
 
-    trunks (N, 2): centres relative to the eye, m. bearings (M,): rad, in the same axes.
-    Returns distance (M,), m along the ray, inf where it hits nothing, and facing (M,), the cosine
-    of the angle between the ray and the surface's normal: 1 head-on, 0 grazing.
+    trunks (N, 2): centres relative to the eye that looks, m. radius: one for all, or (N,), m.
+    bearings (M,): rad, the same for every eye. eye: which eye looks at a trunk, one or (N,).
+    Returns the rays of the first eye, then those of the next: distance (E * M,), m along the ray,
+    inf where it hits nothing, and facing (E * M,), the cosine of the angle between the ray and the
+    surface's normal: 1 head-on, 0 grazing.
 
     >>> raycast(np.array([[5.0, 0.0]]), 0.5, np.array([0.0, 1.0]))
     (array([4.5, inf]), array([1., 0.]))
     """
-    if not len(trunks):
-        return np.full(len(bearings), np.inf), np.zeros(len(bearings))
-    cos, sin = np.cos(bearings), np.sin(bearings)
-    # How far a ray flies until it passes a centre, and by how much it passes it: (N, M) each.
-    along, across = trunks @ np.array([[cos, sin], [-sin, cos]])
-    with np.errstate(invalid="ignore"):
-        half_chord = np.sqrt(radius**2 - across**2)  # (N, M) nan: the ray misses
-    distance = along - half_chord  # (N, M) negative: the trunk is behind
-    distance[~(distance > 0)] = np.inf
-    nearest, rays = distance.argmin(0), np.arange(len(bearings))  # (M,)
-    hit = distance[nearest, rays]  # (M,)
-    return hit, np.where(hit < np.inf, half_chord[nearest, rays] / radius, 0.0)
+    cos, sin, rays = np.cos(bearings), np.sin(bearings), len(bearings)
+    along, across = trunks @ np.array([[cos, sin], [-sin, cos]])  # (N, M), (N, M) m
+    radius, eye = np.full(len(trunks), radius), np.full(len(trunks), eye)  # (N,), (N,)
+    meet = np.flatnonzero(np.abs(across) < radius[:, None])  # (H,) pairs of a trunk and a ray
+    trunk, ray = meet // rays, meet % rays  # (H,), (H,)
+    half_chord = np.sqrt(radius[trunk] ** 2 - across.ravel()[meet] ** 2)  # (H,) m
+    distance = along.ravel()[meet] - half_chord  # (H,) m, negative: the trunk is behind the eye
+    order = np.argsort(-distance)  # (H,) far to near: the nearest is written last, and stays
+    order = order[distance[order] > 0]
+    which = (eye[trunk] * rays + ray)[order]
+    first, facing = np.full(eyes * rays, np.inf), np.zeros(eyes * rays)  # (E * M,), (E * M,)
+    first[which], facing[which] = distance[order], (half_chord / radius[trunk])[order]
+    return first, facing
 
 
 def fade(grey: ndarray, distance: ndarray, scene: Scene) -> ndarray:
-    """Mix a grey level with the sky's, the more the farther: at the end of the view all is haze."""
+    """Mix a grey level with the sky's, the more the farther: where the view ends all is haze."""
     return scene.sky + (grey - scene.sky) * np.maximum(1 - distance / scene.view, 0)
 
 
 @cache
 def backdrop(scene: Scene) -> ndarray:
-    """Sky above the horizon, ground that brightens towards it, as one column (84, 1) uint8."""
+    """Sky above the horizon, and ground that fades towards it, as one column (84, 1) uint8."""
     depth = np.where(SLOPES < 0, scene.altitude / np.abs(SLOPES), np.inf)  # (84,) m
     return fade(np.float64(scene.ground), depth, scene).astype(np.uint8)[:, None]
 
 
 def silhouette(distance: ndarray, height: float, scene: Scene) -> ndarray:
-    """Pixels (84, 84) bool covered by walls of this height that stand at distance (84,) m."""
-    depth = distance * np.cos(BEARINGS)  # (84,) m along the optical axis
-    rows = SLOPES[:, None]  # (84, 1)
-    return (rows < (height - scene.altitude) / depth) & (rows > -scene.altitude / depth)
+    """Pixels (84, E * 84) bool that walls of this height cover, at distance (E * 84,) m."""
+    depth = distance * np.tile(COSINES, len(distance) // PIXELS)  # (E * 84,) m
+    top = CENTRE - FOCAL * (height - scene.altitude) / depth  # (E * 84,) rows
+    foot = CENTRE + FOCAL * scene.altitude / depth  # (E * 84,) rows
+    return (row_number(np.floor(top) + 1) <= ROWS) & (row_number(np.ceil(foot)) > ROWS)
+
+
+def row_number(row: ndarray) -> ndarray:
+    """Rows as small integers, 0 to 84, that compare quickly."""
+    return np.minimum(np.maximum(row, 0), PIXELS).astype(np.uint8)
 
 
 def camera(
-    eye: Point, heading: float, trunks: ndarray, scene: Scene, beacon: Point | None = None
+    poses: ndarray, trunks: Sequence[ndarray], scene: Scene, beacon: Point | None = None
 ) -> ndarray:
-    """Draw what the drone sees: a frame (84, 84) uint8.
+    """Draw what E drones see, all at once: frames (E, 84, 84) uint8.
 
-    eye: x, y in m. heading: rad, counter-clockwise from x. trunks (N, 2): centres in m.
+    poses (E, 3): x, y in m and heading in rad. trunks: for each drone its forest, (N, 2) in m.
     beacon: where the goal's pole stands, or None where there is none; it shows from any distance.
+    The E pictures are drawn side by side, as one picture of E * 84 columns, and cut at the end.
     """
-    cos, sin = math.cos(heading), math.sin(heading)
-    to_body = np.array([[cos, -sin], [sin, cos]])  # (2, 2) x, y -> ahead, left
-    body = (trunks - eye) @ to_body  # (N, 2)
-    ahead, left = body.T
+    eyes, at, heading = len(poses), poses[:, :2], poses[:, 2]
+    cos, sin = np.cos(heading), np.sin(heading)  # (E,), (E,)
+    turn = np.array([[cos, -sin], [sin, cos]]).transpose(2, 0, 1)  # (E, 2, 2) x, y -> ahead, left
+    body = [(forest - xy) @ to for forest, xy, to in zip(trunks, at, turn, strict=True)]
+    eye = np.repeat(np.arange(eyes), [len(forest) for forest in trunks])  # (N,) who looks at it
+    body = np.concatenate(body)  # (N, 2) m, every trunk in the axes of the drone that looks at it
+    ahead, left = body.T  # (N,), (N,) m
     near = (ahead > 0) & (ahead < scene.view) & (np.abs(left) < ahead + 2 * scene.trunk_radius)
-    distance, facing = raycast(body[near], scene.trunk_radius, BEARINGS)  # (84,), (84,)
-    bark = scene.trunk_grazing + (scene.trunk_facing - scene.trunk_grazing) * facing
-    grey = fade(bark, distance, scene).astype(np.uint8)  # (84,)
-    trunk = silhouette(distance, scene.trunk_height, scene)  # (84, 84)
-    frame = np.where(trunk, grey, backdrop(scene))  # (84, 84)
-    if beacon is None:
-        return frame
-    goal = (np.array([beacon]) - eye) @ to_body  # (1, 2)
-    radius = max(scene.beacon_radius, scene.beacon_pixels / 2 / FOCAL * goal[0, 0])
-    pole_distance, _ = raycast(goal, radius, BEARINGS)  # (84,)
-    pole = silhouette(pole_distance, scene.beacon_height, scene)  # (84, 84)
-    frame[pole & ~(trunk & (distance < pole_distance))] = scene.beacon_grey
-    return frame
+    distance, facing = raycast(
+        body[near], scene.trunk_radius, BEARINGS, eye[near], eyes
+    )  # (E * 84,)
+    bark = scene.trunk_grazing + (scene.trunk_facing - scene.trunk_grazing) * facing  # (E * 84,)
+    trunk = silhouette(distance, scene.trunk_height, scene)  # (84, E * 84)
+    grey = fade(bark, distance, scene).astype(np.uint8)  # (E * 84,)
+    frames = np.where(trunk, grey, backdrop(scene))  # (84, E * 84)
+    if beacon is not None:
+        goal = (np.subtract(beacon, at)[:, None] @ turn)[:, 0]  # (E, 2) m
+        radius = np.maximum(scene.beacon_radius, scene.beacon_pixels / 2 / FOCAL * goal[:, 0])
+        pole_distance, _ = raycast(goal, radius, BEARINGS, np.arange(eyes), eyes)  # (E * 84,) m
+        pole = silhouette(pole_distance, scene.beacon_height, scene)  # (84, E * 84)
+        frames[pole & ~(trunk & (distance < pole_distance))] = scene.beacon_grey
+    return np.ascontiguousarray(frames.reshape(PIXELS, eyes, PIXELS).swapaxes(0, 1))
 
 
 # -------------------------------------------------- pictures for people, not for the network
 
 SCALE = 8  # px a metre on the map
 MARGIN = 4.0  # m around the forest
+PANEL = (624, 328)  # px, a picture of the film
 COLOURS = {"crash": "#d62728", "goal": "#2ca02c", "far": "#17a2b8", "": "#1f77b4"}  # else orange
 
+ENDS = {
+    "": "", "crash": "crashed into a trunk", "goal": "arrived at the goal", "time": "out of time",
+    "far": "crossed: left by the far edge", "side": "left by a side", "back": "left by the back",
+}  # fmt: skip
 
-def draw_map(
-    trunks: ndarray, size: Point, flights: Iterable[tuple[ndarray, str, str]], title: str = ""
-) -> Image.Image:
+
+def draw_map(trunks: ndarray, size: Point, title: str = "") -> Image.Image:
     """Draw a forest from above, x to the right and y up.
 
     trunks (N, 2): centres in m. size: the forest's length and width in m.
-    flights: (path (T, 2) in m, how it ended or "" in the air, label) each, coloured by its end.
     """
-    length, width = size
-
-    def pixel(x: float, y: float) -> Point:
-        return (x + MARGIN) * SCALE, (width / 2 + MARGIN - y) * SCALE
-
-    def disc(x: float, y: float, r: float, colour: str) -> None:
-        draw.ellipse([*pixel(x - r, y + r), *pixel(x + r, y - r)], fill=colour)
-
-    image = Image.new("RGB", tuple(int(m + 2 * MARGIN) * SCALE for m in size), "white")
+    (length, width), pixels = size, [int(metres + 2 * MARGIN) * SCALE for metres in size]
+    image = Image.new("RGB", tuple(pixels), "white")
     draw = ImageDraw.Draw(image)
-    draw.rectangle([*pixel(0, width / 2), *pixel(length, -width / 2)], fill="#f2f2ea")
+    corners = pixel(image, 0, width / 2), pixel(image, length, -width / 2)
+    draw.rectangle(corners, fill="#f2f2ea")
     for x, y in trunks:
-        disc(x, y, Scene.trunk_radius, "#5b5b50")
-    disc(0, 0, 0.8, "#1f77b4")
-    disc(length, 0, 1.6, "#2ca02c")
-    for i, (path, ended, label) in enumerate(flights):
-        colour = COLOURS.get(ended, "#ff7f0e")
-        draw.line([pixel(x, y) for x, y in path], fill=colour, width=3)
-        disc(*path[-1], 0.7, colour)
-        at, side = pixel(path[-1][0], path[-1][1] + 3 - 2 * i), "rm" if path[-1][0] > 75 else "lm"
-        draw.text(at, f" {label} ", fill=colour, font_size=18, anchor=side)
+        disc(image, x, y, Scene.trunk_radius, "#5b5b50")
+    disc(image, 0, 0, 0.8, "#1f77b4")
+    disc(image, length, 0, 1.6, "#2ca02c")
     draw.text((8, 4), title, fill="black", font_size=18)
     return image
 
 
-def save_film(file: Path, frames: Iterable, maps: Iterable, milliseconds: int) -> None:
-    """Write an endless GIF: the camera's frames (T of (84, 84)) beside T maps at half their size.
+def draw_ways(image: Image.Image, ways: Iterable[tuple[ndarray, str, str]]) -> Image.Image:
+    """Draw flights onto a copy of a map: path (T, 2) in m, how it ended or "", label, each."""
+    image = image.copy()
+    draw = ImageDraw.Draw(image)
+    for i, (path, ended, label) in enumerate(ways):
+        colour = COLOURS.get(ended, "#ff7f0e")
+        draw.line([pixel(image, x, y) for x, y in path], fill=colour, width=3)
+        disc(image, *path[-1], 0.7, colour)
+        at = pixel(image, path[-1][0], path[-1][1] + 3 - 2 * i)
+        side = "rm" if at[0] > 0.8 * image.width else "lm"
+        draw.text(at, f" {label} ", fill=colour, font_size=18, anchor=side)
+    return image
 
-    Its last picture stays for two seconds.
+
+def pixel(image: Image.Image, x: float, y: float) -> Point:
+    """Where a place in m stands on a map."""
+    return (x + MARGIN) * SCALE, image.height / 2 - y * SCALE
+
+
+def disc(image: Image.Image, x: float, y: float, r: float, colour: str) -> None:
+    """Draw a filled circle, all in m."""
+    box = [*pixel(image, x - r, y + r), *pixel(image, x + r, y - r)]
+    ImageDraw.Draw(image).ellipse(box, fill=colour)
+
+
+def draw_panel(
+    frame: ndarray, chart: Image.Image, q: ndarray | None, action: int, lines: Sequence[str]
+) -> Image.Image:
+    """One picture of a film: what the drone sees, where it is, what it thinks, how it fares.
+
+    frame (84, 84). chart: a map. q (A,): the values of the actions, or None. action: the chosen
+    one, in red. The sharpest left turn stands leftmost, and the best action is the tallest bar.
     """
-    pictures = []
-    for frame, chart in zip(frames, maps, strict=True):
-        width, height = chart.width // 2, chart.height // 2
-        both = Image.new("RGB", (height + width, height))
-        both.paste(Image.fromarray(frame).resize((height, height), Image.Resampling.NEAREST))
-        both.paste(chart.resize((width, height), Image.Resampling.BILINEAR), (height, 0))
-        pictures.append(both.quantize(256, dither=Image.Dither.NONE))
-    times = [milliseconds] * (len(pictures) - 1) + [2000]
-    pictures[0].save(file, save_all=True, append_images=pictures[1:], duration=times, loop=0)
+    image, actions = Image.new("RGB", PANEL, "white"), 9 if q is None else len(q)
+    draw = ImageDraw.Draw(image)
+    image.paste(Image.fromarray(frame).resize((232, 232), Image.Resampling.NEAREST))
+    image.paste(chart.resize((392, 232), Image.Resampling.BILINEAR), (232, 0))
+    heights = np.zeros(actions) if q is None else (q - q.min()) / max(np.ptp(q), 1e-9)  # (A,) 0..1
+    for a, height in enumerate(heights):
+        x, colour = 224 * (1 - (a + 1) / actions) + 4, "#d62728" if a == action else "#9a9a90"
+        draw.rectangle([x, 304 - 60 * height, x + 224 / actions - 4, 306], fill=colour)
+    draw.text((4, 310), "left    Q, the value of each turn    right", fill="black", font_size=13)
+    draw.text((248, 242), "\n".join(lines), fill="black", font_size=19, spacing=8)
+    return image
+
+
+def save_film(file: Path, pictures: Iterator[Image.Image], milliseconds: int) -> None:
+    """Write an endless GIF, picture by picture as they come."""
+    small = (picture.quantize(64, Image.Quantize.FASTOCTREE) for picture in pictures)
+    next(small).save(file, save_all=True, append_images=small, duration=milliseconds, loop=0)

@@ -4,37 +4,43 @@ import hashlib
 import io
 import pickle
 import resource
+import signal
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
+from torch.optim.optimizer import register_optimizer_step_post_hook
 
+import deepflight
+from deepflight import RunConfig, train
 from dqn import (
-    DEAD,
-    DQN,
-    FAR,
-    GOAL,
     LIVE,
+    TERMINAL,
     TRUNCATED,
+    Agent,
     Batch,
+    DQNConfig,
     QNetwork,
     Replay,
     greedy,
     linear_schedule,
     load,
+    load_weights,
+    lock_folder,
     mirror,
     save,
+    save_weights,
     td_target,
     write_whole,
 )
+from env import World
 
-SETTINGS = SimpleNamespace(
-    device="cpu", gamma=0.9, n=1, batch=16, mirror=False, double=True, goal_value=0.0,
-    precision="float32", optimizer="adam", lr=5e-4, optimizer_eps=1e-4, max_grad_norm=10.0,
-    target_every=25, far_value=0.0,
-)  # fmt: skip
+PLAIN = RunConfig(threads=1, forward_reward=0.0, goal_value=0.0, far_value=0.0)
 
 
 # -------------------------------------------------- the replay
@@ -46,7 +52,7 @@ def play(rows: int, lanes: int, seed: int) -> list[list[tuple]]:
     logs = [[] for _ in range(lanes)]
     for _ in range(rows):
         for log in logs:
-            end = rng.choice([LIVE, DEAD, GOAL, TRUNCATED], p=[0.85, 0.05, 0.05, 0.05])
+            end = rng.choice([LIVE, TERMINAL, TRUNCATED], p=[0.85, 0.1, 0.05])
             frame_number += 1
             log.append((frame_number, int(rng.integers(9)), float(rng.normal()), int(end)))
     return logs
@@ -69,9 +75,22 @@ def fill(logs: list[list[tuple]], capacity: int) -> Replay:
     replay = Replay(capacity, len(logs))
     for row in zip(*logs, strict=True):
         s = np.stack([np.stack([picture(f)] * 4) for f, *_ in row])  # only the newest frame counts
-        s2 = [np.stack([picture(30_000 + f)] * 4) for f, *_ in row]
-        replay.add(s, np.array([x[1] for x in row]), [x[2] for x in row], s2, [x[3] for x in row])
+        s2 = np.stack([np.stack([picture(30_000 + f)] * 4) for f, *_ in row])
+        a, r, end = (np.array(column) for column in list(zip(*row, strict=True))[1:])
+        replay.add(s, a, r, s2, end)
     return replay
+
+
+def one_flight(rewards: Sequence[float], end: int) -> Replay:
+    """A flight after three empty rows, and after it three rows of another that pays much."""
+    ends = [TERMINAL] * 3 + [LIVE] * (len(rewards) - 1) + [end] + [LIVE] * 3
+    paid = [0.0] * 3 + [*rewards] + [1000.0] * 3
+    return fill([[(t + 1, 0, r, e) for t, (r, e) in enumerate(zip(paid, ends, strict=True))]], 20)
+
+
+def window(replay: Replay, row: int, n: int, gamma: float) -> Batch:
+    """One transition of the first lane."""
+    return replay.window(np.array([row]), np.array([0]), n, gamma)
 
 
 def naive(log: list[tuple], t: int, n: int, gamma: float) -> tuple:
@@ -115,7 +134,7 @@ def test_stacks_and_windows_are_those_of_the_whole_history(n: int, rows: int) ->
 def test_samples_are_drawn_from_all_complete_windows_and_no_others() -> None:
     rows, kept, n = 137, 60, 5
     replay = fill(play(rows, 1, seed=0), kept)
-    batch = replay.sample(20_000, n, 0.9, np.random.default_rng(0))
+    batch = replay.sample(2_000, n, 0.9, np.random.default_rng(0))
     drawn = set(number(batch.s)[:, 3])  # frame t carries the number t + 1
     assert drawn == set(range(rows - kept + 3 + 1, rows - n + 1))
 
@@ -147,19 +166,55 @@ def test_a_transition_costs_at_most_7200_bytes() -> None:
 
 def target(r: float, discount: float, end: int, choose: list[float], value: list[float]) -> float:
     """td_target of one transition, on plain numbers."""
-    tensors = [torch.tensor([x]) for x in (r, discount, end, choose, value)]
-    return td_target(*tensors, {DEAD: 0.0, GOAL: 100.0, FAR: 40.0}).item()
+    r, discount, end, value, choose = (torch.tensor([x]) for x in (r, discount, end, value, choose))
+    return td_target(r, discount, end, value, choose).item()
 
 
-def test_the_target_by_hand() -> None:
-    q = [1.0, 3.0, 2.0]
-    assert target(0.5, 0.9, LIVE, q, q) == pytest.approx(0.5 + 0.9 * 3)  # ordinary
-    assert target(-10.0, 0.9, DEAD, q, q) == -10.0  # crashed
-    assert target(0.5, 0.9, GOAL, q, q) == pytest.approx(0.5 + 0.9 * 100)  # arrived
-    assert target(-10.0, 0.9, FAR, q, q) == pytest.approx(-10 + 0.9 * 40)  # left by the far edge
-    assert target(0.5, 0.9, TRUNCATED, q, q) == pytest.approx(
-        0.5 + 0.9 * 3
-    )  # out of time, not dead
+def label(replay: Replay, row: int, n: int, gamma: float, best: float) -> float:
+    """The label of the transition at this row, where the best value of every state is `best`."""
+    batch, q2 = window(replay, row, n, gamma), torch.tensor([[best - 1, best, best - 2]])
+    r, discount, end = map(torch.from_numpy, (batch.r, batch.discount, batch.end))
+    return td_target(r, discount, end, q2, q2).item()
+
+
+def test_the_target_of_the_files_own_example_is_10_4() -> None:
+    q = [9.0, 10.0, -3.0]
+    assert target(0.5, 0.99, LIVE, q, q) == pytest.approx(10.4)
+    assert target(0.5, 0.99, TRUNCATED, q, q) == pytest.approx(10.4)  # out of time, not dead
+    assert target(0.5, 0.99, TERMINAL, q, q) == 0.5
+    assert target(-10.0, 0.99, TERMINAL, q, q) == -10.0  # crashed
+
+
+def test_the_return_of_the_files_own_example_is_minus_7_81() -> None:
+    replay = one_flight([1.0, 1.0, -10.0], TERMINAL)
+    batch = window(replay, 3, 3, 0.99)
+    assert batch.r[0] == pytest.approx(-7.81, abs=0.005)
+    assert batch.end[0] == TERMINAL
+    assert label(replay, 3, 3, 0.99, best=50.0) == pytest.approx(-7.81, abs=0.005)
+
+
+def test_the_label_of_three_rewards_by_hand() -> None:
+    for end, after in ((LIVE, 8.0), (TRUNCATED, 8.0), (TERMINAL, 0.0)):
+        replay = one_flight([4.0, 2.0, -6.0], end)
+        three = 4 + 0.5 * 2 + 0.25 * -6  # 3.5
+        assert window(replay, 3, 3, 0.5).r[0] == three
+        assert window(replay, 3, 3, 0.5).discount[0] == 0.125
+        assert label(replay, 3, 3, 0.5, best=8.0) == three + 0.125 * after
+        assert label(replay, 4, 2, 0.5, best=8.0) == 2 + 0.5 * -6 + 0.25 * after
+        assert label(replay, 5, 1, 0.5, best=8.0) == -6 + 0.5 * after
+        if end != LIVE:  # nothing of the next flight is in the label
+            assert label(replay, 3, 6, 0.5, best=8.0) == three + 0.125 * after
+
+
+def test_a_value_paid_at_the_end_is_the_bootstrap_of_a_state_of_that_value() -> None:
+    gamma, worth = 0.99, 125.0
+    for n in (1, 2, 3, 5):
+        for length in range(1, n + 1):  # the flight ends within the window
+            rewards = np.linspace(-1.0, 1.25, length)
+            paid = one_flight([*rewards[:-1], rewards[-1] + gamma * worth], TERMINAL)
+            goes_on = one_flight(rewards, LIVE)  # and its next state is worth that much
+            expected = label(goes_on, 3, length, gamma, best=worth)
+            assert label(paid, 3, n, gamma, best=-77.0) == pytest.approx(expected, rel=1e-6)
 
 
 def test_double_dqn_values_with_one_network_what_the_other_chose() -> None:
@@ -171,17 +226,32 @@ def test_double_dqn_values_with_one_network_what_the_other_chose() -> None:
 # -------------------------------------------------- the mirror
 
 
-def test_mirroring_flips_frames_and_actions_of_the_chosen_only() -> None:
+def test_mirroring_reflects_whole_transitions_and_half_of_them() -> None:
     rng = np.random.default_rng(0)
-    s, s2 = rng.integers(256, size=(2, 6, 4, 84, 84), dtype=np.uint8)
-    a, r = np.arange(6), np.zeros(6, np.float32)
-    batch = Batch(s.copy(), a.copy(), r, s2.copy(), r, r)
-    flip = np.array([True, False, True, False, False, True])
-    flipped = mirror(batch, flip, 9)
-    for i in range(6):
-        assert (flipped.s[i] == (s[i, ..., ::-1] if flip[i] else s[i])).all()
-        assert (flipped.s2[i] == (s2[i, ..., ::-1] if flip[i] else s2[i])).all()
-    assert flipped.a.tolist() == [8, 1, 6, 3, 4, 3]
+    s, s2 = rng.integers(256, size=(2, 64, 4, 84, 84), dtype=np.uint8)
+    a, r, discount = np.arange(64) % 9, rng.normal(size=64), rng.random(64)
+    end = rng.integers(3, size=64)
+    batch = mirror(Batch(s.copy(), a.copy(), r.copy(), s2.copy(), discount, end), 9, rng)
+    flipped = np.array([(x == y[..., ::-1]).all() for x, y in zip(batch.s, s, strict=True)])
+    assert 20 <= flipped.sum() <= 44  # three standard deviations
+    turned = flipped[:, None, None, None]
+    assert (batch.s == np.where(turned, s[..., ::-1], s)).all()
+    assert (batch.s2 == np.where(turned, s2[..., ::-1], s2)).all()
+    assert (
+        batch.a == np.where(flipped, 8 - a, a)
+    ).all()  # the sharpest left for the sharpest right
+    assert (batch.r == r).all()
+    assert (batch.discount == discount).all()
+    assert (batch.end == end).all()
+
+
+def test_other_draws_reflect_other_transitions() -> None:
+    pictures, zeros = np.zeros((64, 4, 84, 84), np.uint8), np.zeros(64)
+    rng, drawn = np.random.default_rng(0), set()
+    for _ in range(5):
+        a = np.zeros(64, int)
+        drawn.add(tuple(mirror(Batch(pictures, a, zeros, pictures, zeros, zeros), 9, rng).a))
+    assert len(drawn) == 5
 
 
 # -------------------------------------------------- the network and the agent
@@ -195,7 +265,7 @@ def test_the_network_is_natures() -> None:
 
 def test_equal_seeds_give_equal_networks_and_leave_torchs_own_generator_alone() -> None:
     before = torch.random.get_rng_state()
-    one, two, other = (DQN(SETTINGS, 9, seed).q.state_dict() for seed in (1, 1, 10**40))
+    one, two, other = (Agent(DQNConfig(), 9, n).q.state_dict() for n in (1, 1, 10**40))
     assert (torch.random.get_rng_state() == before).all()
     assert all((one[key] == two[key]).all() for key in one)
     assert any((one[key] != other[key]).any() for key in one)
@@ -210,64 +280,224 @@ def test_bfloat16_moves_values_by_a_twentieth_of_their_spread_at_most() -> None:
     assert (fast - exact).abs().mean() < 0.05 * exact.std()
 
 
-def test_the_target_network_is_copied_every_so_many_updates_and_not_between() -> None:
-    agent, memory = DQN(SETTINGS, 2, seed=0), corridor(200)
-    rng = np.random.default_rng(0)
-    start = agent.q_target.head[2].bias.clone()
-    for _ in range(SETTINGS.target_every - 1):
-        agent.learn(memory, 1e-3, 1.0, 1.0, rng)
-    assert (agent.q_target.head[2].bias == start).all()
-    agent.learn(memory, 1e-3, 1.0, 1.0, rng)
-    assert (agent.q_target.head[2].bias == agent.q.head[2].bias).all()
+def test_an_agent_begins_with_equal_networks_and_no_mean() -> None:
+    agent = Agent(DQNConfig(), 9, seed=0)
+    assert same(agent.q, agent.q_target)
+    assert agent.mean.n_averaged == agent.updates == 0
+    assert len({id(p) for p in agent.parameters()}) == 3 * 10  # of which nobody shares any
 
 
-def corridor(steps: int) -> Replay:
-    """Four cells in a row, left or right at random: the right end pays 1, the left end -1.
-
-    A frame is dark but for a bright stripe where the drone is.
-    """
-    rng, memory, cell = np.random.default_rng(0), Replay(steps, 1), 1
-    for _ in range(steps):
-        a = int(rng.integers(2))
-        after = cell + 2 * a - 1
-        end = LIVE if 0 <= after <= 3 else DEAD
-        r = float(after == 4) - float(after == -1)
-        memory.add(stripe(cell)[None], np.array([a]), [r], [stripe(after)], [end])
-        cell = after if end == LIVE else int(rng.integers(4))
-    return memory
+def same(one: torch.nn.Module, two: torch.nn.Module) -> bool:
+    """Whether two networks have equal weights, to the last bit."""
+    return all(map(torch.equal, one.parameters(), two.parameters()))
 
 
-def stripe(cell: int) -> np.ndarray:
-    """What cell looks like (4, 84, 84)."""
-    s = np.zeros((4, 84, 84), np.uint8)
-    s[..., 21 * cell : 21 * cell + 21] = 255
-    return s
+@pytest.mark.parametrize("adam", [True, False])
+def test_an_agent_that_is_saved_and_loaded_goes_on_as_if_nothing_had_been(
+    adam: bool, tmp_path: Path
+) -> None:
+    c = DQNConfig(adam=adam, lr=1e-3)
+    one, two = Agent(c, 9, seed=0), Agent(c, 9, seed=1)
+    for _ in range(3):
+        descend(one, -3.0, 1.0)
+        one.mean.update_parameters(one.q)
+    save(tmp_path / "a.pt", "agent", {"agent": one.state_dict()})
+    two.load_state_dict(load(tmp_path / "a.pt", "agent")["agent"])
+    assert two.updates == 3
+    for agent in (one, two):  # with the optimizer's moments lost, these would go elsewhere
+        descend(agent, -3.0, 1.0)
+        agent.mean.update_parameters(agent.q)
+    assert same(one, two)
+    assert not same(one.q, one.q_target)
+    assert two.mean.n_averaged == 4
 
 
-@pytest.mark.parametrize("n", [1, 3])
-def test_the_agent_solves_a_tiny_mdp(n: int) -> None:
-    settings = SimpleNamespace(**(vars(SETTINGS) | {"n": n}))
-    agent, memory, rng = DQN(settings, 2, seed=0), corridor(1000), np.random.default_rng(1)
-    for update in range(300):
-        agent.learn(memory, linear_schedule(update, 5e-4, 1e-5, 300), 1.0, 1.0, rng)
-    states = np.stack([stripe(cell) for cell in range(4)])
-    assert greedy(agent.q, states).tolist() == [1, 1, 1, 1]
-    if n == 1:  # longer windows of a random walk are off-policy, so their values are lower
-        best = agent.q(torch.from_numpy(states)).max(1).values.detach().numpy()
-        assert best == pytest.approx([0.9**3, 0.9**2, 0.9, 1.0], abs=0.1)
+def descend(agent: Agent, y: torch.Tensor | float, delta: float) -> None:
+    """One gradient step of all values of one state towards y."""
+    q = agent.q(torch.from_numpy(stripe(1))[None])
+    agent.optimizer.zero_grad()
+    F.smooth_l1_loss(q, torch.as_tensor(y).expand_as(q), beta=delta).backward()
+    agent.optimizer.step()
+    agent.updates += 1
 
 
 @pytest.mark.parametrize(("delta", "learnt"), [(1.0, 0.0), (1000.0, -10.0)])
 def test_clipped_errors_learn_the_median_and_squared_ones_the_mean(
     delta: float, learnt: float
 ) -> None:
-    agent, memory, rng = DQN(SETTINGS, 2, seed=0), Replay(1000, 1), np.random.default_rng(0)
-    for step in range(1000):  # one step an episode, and one in ten of them ends badly
-        memory.add(stripe(1)[None], np.zeros(1), [-100.0 * (step % 10 == 0)], [stripe(1)], [DEAD])
-    for update in range(150):
-        agent.learn(memory, linear_schedule(update, 2e-3, 1e-5, 150), delta, 1.0, rng)
-    q = agent.q(torch.from_numpy(stripe(1))[None])[0, 0].item()
+    agent, state = Agent(DQNConfig(), 10, seed=0), torch.from_numpy(stripe(1))[None]
+    for update in range(150):  # every action crashes every tenth time
+        agent.optimizer.param_groups[0]["lr"] = linear_schedule(update, 2e-3, 1e-5, 150)
+        descend(agent, -100.0 * (torch.arange(10) == update % 10), delta)
+    q = agent.q(state).mean().item()
     assert q == pytest.approx(learnt, abs=1.5)
+
+
+# -------------------------------------------------- the training, in a world of four cells
+
+
+class Walker:
+    """Four cells in a row, 0 goes left, 1 right: the right end pays 1, the left end -1.
+
+    A picture is dark but for a bright stripe where the walker is.
+    """
+
+    def __init__(self) -> None:
+        self.outcome = "not reset"
+
+    def reset(self, seed: int) -> None:
+        """Begin in the cell that the seed names."""
+        self.seed, self.cell, self.actions, self.outcome, self.total = seed, seed % 4, "", "", 0.0
+
+    def step(self, action: int) -> float:
+        """Walk one cell; returns the reward."""
+        self.cell += 2 * action - 1
+        self.actions += str(action)
+        self.outcome = {-1: "left", 4: "goal"}.get(self.cell, "")
+        r = {-1: -1.0, 4: 1.0}.get(self.cell, 0.0)
+        self.total += r
+        return r
+
+    def flight(self) -> dict:
+        """What came of the walk, in the words of ForestEnv.flight."""
+        walked = {"seed": self.seed, "actions": self.actions, "outcome": self.outcome, "edge": ""}
+        return walked | {"steps": len(self.actions), "progress": 0.0, "return": self.total}
+
+
+class Corridor:
+    """Walkers side by side, as Fleet has drones."""
+
+    def __init__(self, world: World, lanes: int) -> None:
+        self.world, self.envs = world, [Walker() for _ in range(lanes)]
+
+    @property
+    def landed(self) -> list[int]:
+        """The lanes of the walkers that have arrived, at either end."""
+        return [lane for lane, walker in enumerate(self.envs) if walker.outcome]
+
+    @property
+    def observations(self) -> np.ndarray:
+        """What the walkers see (L, 4, 84, 84)."""
+        return np.stack([stripe(walker.cell) for walker in self.envs])
+
+    def reset(self, lanes: Sequence[int], seeds: Iterable[int]) -> None:
+        """Begin a walk in these lanes."""
+        for lane, seed in zip(lanes, seeds, strict=True):
+            self.envs[lane].reset(int(seed))
+
+    def step(self, actions: Iterable[int]) -> tuple:
+        """Observations, rewards, terminated, truncated and infos of all walkers."""
+        r = [walker.step(int(a)) for walker, a in zip(self.envs, actions, strict=True)]
+        terminated = np.array([walker.outcome != "" for walker in self.envs])
+        infos = [{"forward": 0.0, "outcome": walker.outcome} for walker in self.envs]
+        return self.observations, np.array(r), terminated, np.zeros_like(terminated), infos
+
+    def record(self, steps: int) -> list[list[tuple[int, str]]]:
+        """No walk is flown again."""
+        return [[] for _ in self.envs]
+
+
+def stripe(cell: int) -> np.ndarray:
+    """What cell looks like (4, 84, 84), and all dark beyond the ends."""
+    s = np.zeros((4, 84, 84), np.uint8)
+    s[..., max(21 * cell, 0) : max(21 * cell + 21, 0)] = 255
+    return s
+
+
+@pytest.fixture(autouse=True)
+def alone() -> Iterator[None]:
+    """One thread, because another may wait for a busy core; and signals given back after."""
+    torch.set_num_threads(1)
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
+SHORT = partial(World, actions=2, max_steps=5)  # of the test flights and the random ones
+WALK = DQNConfig(
+    steps=1200, num_envs=4, gamma=0.9, replay_size=1600, learning_starts=200, update_every=4,
+    batch_size=16, target_every=25, epsilon_final=1.0, lr=5e-4, lr_decay=0.02, n_steps=1,
+    mirror=False, huber=1.0, average=0.0, bfloat16=False,
+)  # fmt: skip
+
+
+@pytest.fixture
+def corridor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `train` walk the corridor."""
+    monkeypatch.setattr(deepflight, "Fleet", Corridor)
+    monkeypatch.setattr(deepflight, "World", SHORT)
+
+
+@pytest.mark.parametrize(("n_steps", "steps"), [(1, 1600), (3, 1000)])
+@pytest.mark.usefixtures("corridor")
+def test_a_training_solves_a_tiny_mdp(n_steps: int, steps: int, tmp_path: Path) -> None:
+    assert train(replace(WALK, n_steps=n_steps, steps=steps), PLAIN, tmp_path) == 0
+    q, states = load_weights(tmp_path / "best.pt", 2), np.stack([stripe(x) for x in range(4)])
+    assert greedy(q, states).tolist() == [1, 1, 1, 1]
+    if n_steps == 1:  # longer windows of a random walk are off-policy, so their values are lower
+        best = q(torch.from_numpy(states)).max(1).values.detach().numpy()
+        assert best == pytest.approx([0.9**3, 0.9**2, 0.9, 1.0], abs=0.1)
+
+
+def strides(c: DQNConfig, folder: Path) -> list[tuple[float, torch.Tensor]]:
+    """Train; returns the learning rate of each update and Q's last layer after it."""
+    taken = []
+
+    def note(optimizer: torch.optim.Optimizer, *_: object) -> None:
+        group = optimizer.param_groups[0]
+        taken.append((group["lr"], group["params"][-2].detach().clone()))
+
+    hook = register_optimizer_step_post_hook(note)
+    try:
+        assert train(c, PLAIN, folder) == 0
+    finally:
+        hook.remove()
+    return taken
+
+
+@pytest.mark.usefixtures("corridor")
+def test_the_target_network_is_an_old_copy_and_in_the_end_the_mean_of_the_weights_flies(
+    tmp_path: Path,
+) -> None:
+    c = replace(WALK, steps=480, learning_starts=240, batch_size=4, average=0.25, lr=1e-3)
+    rates, newest = zip(*strides(replace(c, lr_decay=0.5), tmp_path), strict=True)
+    assert rates == pytest.approx([1e-3 * (1 - 0.5 * step / 480) for step in range(240, 481, 4)])
+    agent = Agent(c, 2, seed=1)
+    agent.load_state_dict(load(tmp_path / "checkpoint.pt", "checkpoint")["agent"])
+    assert agent.updates == 61
+    assert torch.equal(agent.q.head[2].weight, newest[-1])
+    assert torch.equal(agent.q_target.head[2].weight, newest[49])  # of update 50, not 25 or 61
+    assert agent.mean.n_averaged == 30  # at step 364, 368, ... 480
+    mean = torch.stack(newest[-30:]).mean(0)
+    assert torch.allclose(agent.mean.module.head[2].weight, mean, rtol=0, atol=1e-6)
+    assert not torch.allclose(newest[-1], mean, rtol=0, atol=1e-4)
+    best = load_weights(tmp_path / "best.pt", 2).state_dict()
+    for name, value in agent.mean.module.state_dict().items():
+        assert torch.equal(best[name], value.half().float())
+
+
+@pytest.mark.usefixtures("corridor")
+def test_where_the_copy_falls_on_the_last_update_both_networks_are_equal(tmp_path: Path) -> None:
+    c = replace(WALK, steps=96, learning_starts=60, batch_size=4, target_every=5)  # 10 updates
+    train(c, PLAIN, tmp_path)
+    agent = Agent(c, 2, seed=1)
+    agent.load_state_dict(load(tmp_path / "checkpoint.pt", "checkpoint")["agent"])
+    assert agent.updates == 10
+    assert same(agent.q, agent.q_target)
+    assert same(load_weights(tmp_path / "best.pt", 2), agent.q.half().float())  # no mean: Q flies
+
+
+@pytest.mark.usefixtures("corridor")
+def test_errors_are_clipped_at_1_until_the_step_that_lifts_it(tmp_path: Path) -> None:
+    c = replace(WALK, steps=120, learning_starts=60, batch_size=4)
+    narrow, wide = (
+        [weights for _, weights in strides(replace(c, huber=h, huber_after=80), tmp_path / str(h))]
+        for h in (1.0, 100.0)
+    )
+    equal = [torch.equal(x, y) for x, y in zip(narrow, wide, strict=True)]
+    assert equal == [step <= 80 for step in range(60, 121, 4)]
 
 
 # -------------------------------------------------- files that are whole, or not there
@@ -302,6 +532,28 @@ def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["w.pt"], "nothing is left beside it"
     plain = torch.load(path, weights_only=True)
     assert torch.equal(plain["x"], content["x"]), "torch itself reads it: the digest stands behind"
+
+
+def test_weights_are_halved_and_fit_their_own_world_and_actions_only(tmp_path: Path) -> None:
+    q, path = Agent(DQNConfig(), 9, seed=0).q, tmp_path / "w.pt"
+    save_weights(path, q, beacon=True)
+    assert path.stat().st_size < 3.5e6
+    for name, value in load_weights(path, 9, beacon=True).state_dict().items():
+        assert torch.equal(value, q.state_dict()[name].half().float())
+    with pytest.raises(ValueError, match=r"trained with \{'beacon': True\}, here is"):
+        load_weights(path, 9, beacon=False)
+    with pytest.raises(ValueError, match="another network"):
+        load_weights(path, 5, beacon=True)
+
+
+def test_a_folder_is_held_by_one_at_a_time(tmp_path: Path) -> None:
+    held = lock_folder(tmp_path)
+    with pytest.raises(ValueError, match="another training's"):
+        lock_folder(tmp_path)
+    held.close()
+    lock_folder(tmp_path).close()
+    with pytest.raises(ValueError, match="cannot be held"):
+        lock_folder(tmp_path / "nowhere")
 
 
 def test_a_file_with_any_byte_changed_is_refused(tmp_path: Path) -> None:

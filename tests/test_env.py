@@ -10,14 +10,28 @@ import pytest
 from hypothesis import given, reject
 from hypothesis import strategies as st
 
-from env import ForestEnv, World, plant, refly, reward
-from render import camera, raycast
+from env import (
+    Fleet,
+    ForestEnv,
+    World,
+    dynamic_window,
+    fly,
+    fly_random,
+    laser_pilot,
+    measure,
+    plant,
+    random_pilot,
+    refly,
+    reward,
+    straight_pilot,
+)
 
 WORLD = World()
 CLEARING = replace(WORLD, rows=0)  # no trunks
+OPEN = (np.linspace(0, 2 * math.pi, 360, endpoint=False), np.full(360, 20.0))  # a scan of nothing
 
 
-def fly(env: ForestEnv, actions: Sequence[int], seed: int = 0) -> tuple:
+def flown(env: ForestEnv, actions: Sequence[int], seed: int = 0) -> tuple:
     """Reset and fly; returns what the last step returned."""
     env.reset(seed=seed)
     for action in actions:
@@ -96,24 +110,8 @@ def test_the_scan_starts_dead_ahead_and_goes_counter_clockwise() -> None:
     assert distance[0] == 20.0
 
 
-def test_the_trunks_around_are_all_that_eye_and_laser_can_reach() -> None:
-    forest = dict(length=300.0, width=200.0, rows=50, columns=40, first_y=-97.0)
-    wide = World(**forest, laser_range=60.0)  # farther than the eye sees
-    env, rng = ForestEnv(wide), np.random.default_rng(0)
-    for seed in range(5):
-        env.reset(seed=seed)
-        while not env.outcome:
-            env.step(int(rng.integers(9)))
-            eye, heading = env.drone.position, env.drone.angle
-            assert np.array_equal(env.observation[-1], camera(eye, heading, env.trunks, wide))
-            bearings, seen = env.scan()
-            hit, _ = raycast(env.trunks - eye, wide.trunk_radius, bearings + heading)
-            assert np.array_equal(seen, np.minimum(hit, wide.laser_range))
-        assert len(env.around) < len(env.trunks) / 3
-
-
 def test_going_straight_makes_half_a_metre_a_step() -> None:
-    *_, info = fly(ForestEnv(CLEARING), [4] * 10)
+    *_, info = flown(ForestEnv(CLEARING), [4] * 10)
     assert info["pose"] == pytest.approx((5.0, 0.0, 0.0))
     assert info["d_goal"] == pytest.approx(85.0)
     assert info["d_obs"] == 20.0
@@ -122,7 +120,7 @@ def test_going_straight_makes_half_a_metre_a_step() -> None:
 @pytest.mark.parametrize("action", range(9))
 def test_each_action_turns_at_its_yaw_rate_and_then_flies(action: int) -> None:
     rate = 0.7 * (action - 4) / 4  # 0 is right, 8 is left
-    *_, info = fly(ForestEnv(CLEARING), [action] * 7)
+    *_, info = flown(ForestEnv(CLEARING), [action] * 7)
     headings = rate * 0.1 * np.arange(1, 8)
     expected = (0.5 * np.cos(headings).sum(), 0.5 * np.sin(headings).sum(), 0.7 * rate)
     assert info["pose"] == pytest.approx(expected)
@@ -143,9 +141,9 @@ def test_each_flight_has_its_outcome_and_its_edge(
 ) -> None:
     env = ForestEnv(CLEARING, camera=False)
     env.reset(seed=0)
-    flown = iter(actions)
+    left = iter(actions)
     while not env.outcome:
-        _, r, terminated, truncated, info = env.step(next(flown))
+        _, r, terminated, truncated, info = env.step(next(left))
     assert (info["outcome"], info["edge"]) == (outcome, edge)
     assert truncated == (outcome == "time")
     assert terminated != truncated
@@ -188,6 +186,25 @@ def test_a_flight_is_its_seed_and_its_actions() -> None:
         assert again[-1][-1]["progress"] == env.flight()["progress"]
 
 
+def test_forward_is_the_way_gained_along_x_and_adds_up_to_x() -> None:
+    env, rng = ForestEnv(CLEARING, camera=False), np.random.default_rng(1)
+    env.reset(seed=0)
+    x = gained = 0.0
+    while not env.outcome:  # it flies ahead, and back as well
+        *_, info = env.step(int(rng.integers(5, 9)))
+        gained += info["forward"]
+        assert info["forward"] == pytest.approx(info["pose"][0] - x)
+        x = info["pose"][0]
+        assert gained == pytest.approx(x)
+        assert env.progress >= x
+    _, info = env.reset(seed=1)
+    assert (info["forward"], env.progress) == (0.0, 0.0)
+
+
+def test_the_step_of_the_files_own_example_earns_minus_1_67() -> None:
+    assert reward("", 1.5, 60.0, WORLD) == pytest.approx(-2 + 1 / 3)
+
+
 def test_an_observation_is_the_last_four_frames_and_starts_as_one_frame_four_times() -> None:
     env = ForestEnv()
     first, _ = env.reset(seed=0)
@@ -203,12 +220,12 @@ def test_an_observation_is_the_last_four_frames_and_starts_as_one_frame_four_tim
 
 def test_without_a_camera_only_the_frames_are_missing() -> None:
     seeing, blind = ForestEnv(), ForestEnv(camera=False)
-    assert not fly(blind, [4, 5, 6])[0].any()
-    assert fly(blind, [4, 5, 6])[1:] == fly(seeing, [4, 5, 6])[1:]
+    assert not flown(blind, [4, 5, 6])[0].any()
+    assert flown(blind, [4, 5, 6])[1:] == flown(seeing, [4, 5, 6])[1:]
 
 
 def test_step_returns_plain_python_numbers_as_gymnasium_asks() -> None:
-    _, r, terminated, truncated, info = fly(ForestEnv(), [4])
+    _, r, terminated, truncated, info = flown(ForestEnv(), [4])
     assert type(r) is float
     assert type(terminated) is type(truncated) is bool
     assert type(info["d_obs"]) is type(info["d_goal"]) is float
@@ -280,6 +297,143 @@ def test_an_impossible_world_is_refused_by_the_name_of_what_is_wrong(
 ) -> None:
     with pytest.raises(ValueError, match=named):
         World(**settings)
+
+
+# -------------------------------------------------- a fleet
+
+
+def test_a_fleet_flies_as_its_drones_would_alone() -> None:
+    world = replace(WORLD, beacon=True, max_steps=30)  # some crash, some run out of time
+    fleet, rng, ends = Fleet(world, 5), np.random.default_rng(0), []
+    alone = [ForestEnv(world) for _ in range(5)]
+    for step in range(300):
+        if step % 7 == 0:  # those that landed have waited
+            seeds = rng.integers(10**9, size=len(fleet.landed))
+            for lane, seed in zip(fleet.landed, seeds, strict=True):
+                alone[lane].reset(seed=int(seed))
+            fleet.reset(fleet.landed, seeds)
+        flying = [env for env in alone if not env.outcome]
+        waiting = [(lane, env.flight()) for lane, env in enumerate(fleet.envs) if env.outcome]
+        assert fleet.landed == [lane for lane, _ in waiting]
+        assert [env.seed for env in fleet.flying] == [env.seed for env in flying]
+        assert (fleet.observations == np.stack([env.observation for env in flying])).all()
+        actions = rng.integers(2, 7, size=len(flying))
+        results = list(zip(*fleet.step(actions), strict=True))
+        for env, a, (s2, r, terminated, truncated, info) in zip(
+            flying, actions, results, strict=True
+        ):
+            lone_s2, *lone = env.step(a)
+            assert (s2 == lone_s2).all()
+            assert [r, terminated, truncated, info] == lone
+            ends += [env.outcome] if env.outcome else []
+        assert waiting == [(lane, fleet.envs[lane].flight()) for lane, _ in waiting]
+    assert ends.count("crash") > 9
+    assert ends.count("time") > 9
+
+
+def test_the_record_holds_the_flights_of_the_last_steps_and_they_fly_again() -> None:
+    fleet, rng, last = Fleet(WORLD, 3), np.random.default_rng(0), 60
+    steps = [[] for _ in range(3)]  # of each lane: number of the flight, frame
+    flights = [[] for _ in range(3)]  # of each lane: seed, digits
+    for _ in range(250):
+        landed = fleet.landed
+        for lane, seed in zip(landed, seeds := rng.integers(10**9, size=len(landed)), strict=True):
+            flights[lane].append((seed, ""))
+        fleet.reset(landed, seeds)
+        actions = rng.integers(2, 7, size=3)
+        s2, *_ = fleet.step(actions)
+        for lane, (a, frame) in enumerate(zip(actions, s2[:, -1], strict=True)):
+            seed, digits = flights[lane][-1]
+            flights[lane][-1] = (seed, f"{digits}{a}")
+            steps[lane].append((len(flights[lane]) - 1, frame))
+        oldest = [lane[-last:][0][0] for lane in steps]
+        assert fleet.record(last) == [f[i:] for f, i in zip(flights, oldest, strict=True)]
+    assert all(len(lane) > 5 for lane in flights)
+    for lane, record in enumerate(fleet.record(last)):
+        frames = [o[-1] for seed, digits in record for o, *_ in [*refly(seed, digits, WORLD)][1:]]
+        assert len(frames) >= last
+        assert (np.array(frames[-last:]) == [frame for _, frame in steps[lane][-last:]]).all()
+
+
+def test_a_fleet_needs_an_action_for_each_drone_in_the_air() -> None:
+    fleet = Fleet(WORLD, 2, camera=False)
+    fleet.reset([0, 1], [0, 1])
+    for actions in ([4], [4, 4, 4], [4, 9]):
+        with pytest.raises(ValueError, match=r"zip|allowed are 0 to 8"):
+            fleet.step(actions)
+
+
+# -------------------------------------------------- pilots
+
+
+def test_in_the_open_the_laser_pilot_turns_to_the_goal() -> None:
+    assert dynamic_window(*OPEN, 0.0, WORLD) == 4
+    assert dynamic_window(*OPEN, 2.0, WORLD) == 8
+    assert dynamic_window(*OPEN, -2.0, WORLD) == 0
+    assert dynamic_window(*OPEN, 0.35 * 1.5, WORLD) == 6  # 0.35 rad/s for 1.5 s
+
+
+def test_the_laser_pilot_turns_away_from_a_trunk_ahead() -> None:
+    bearings, distances = OPEN[0], OPEN[1].copy()
+    distances[:12] = 4.0  # bark from dead ahead to 12 degrees left
+    assert dynamic_window(bearings, distances, 0.0, WORLD) < 4
+    assert dynamic_window(bearings, np.roll(distances, -11), 0.0, WORLD) > 4
+
+
+def test_the_laser_pilot_arrives_and_never_crashes() -> None:
+    flights = fly(laser_pilot, range(2 * 10**9, 2 * 10**9 + 20), WORLD, camera=False)
+    assert not any(f["outcome"] == "crash" for f in flights)
+    assert sum(f["outcome"] == "goal" for f in flights) >= 17
+
+
+def test_the_random_pilot_draws_its_actions_uniformly() -> None:
+    flights = fly_random([5, 6], WORLD, np.random.default_rng(0))
+    assert len(flights) == 2000
+    assert [f["seed"] for f in flights[:4]] == [5, 6, 5, 6]
+    actions = "".join(f["actions"] for f in flights)
+    shares = np.array([actions.count(str(a)) for a in range(9)]) / len(actions)
+    assert shares == pytest.approx(1 / 9, abs=0.006)  # four standard errors of 40,000 draws
+
+
+def test_the_straight_pilot_flies_along_the_middle_line() -> None:
+    (flight,) = fly(straight_pilot, [0], CLEARING, camera=False)
+    assert (flight["outcome"], flight["steps"]) == ("goal", 175)  # within 3 m of x = 90 m
+    assert flight["actions"] == "4" * 175
+
+
+def test_flights_come_in_the_order_of_their_seeds_and_as_each_flies_alone() -> None:
+    seeds = [*range(130, 0, -1), 7, 7]  # more than fly at once, and one forest thrice
+    env, flights = ForestEnv(camera=False), fly(straight_pilot, seeds, WORLD, camera=False)
+    assert [f["seed"] for f in flights] == seeds
+    for seed, flight in zip(seeds, flights, strict=True):
+        straight_to_the_end(env, seed)
+        assert flight == env.flight()
+
+
+def test_a_pilot_that_looks_flies_by_what_its_camera_sees() -> None:
+    seen = []
+
+    def pilot(fleet: Fleet) -> Sequence[int]:
+        seen.append(fleet.observations)
+        return random_pilot(np.random.default_rng(len(seen)))(fleet)
+
+    (flight,) = fly(pilot, [3], WORLD)
+    frames = [o for o, *_ in refly(3, flight["actions"], WORLD)]
+    assert (np.concatenate(seen) == frames[:-1]).all()
+
+
+def test_one_measure_a_flight_by_hand() -> None:
+    flight = {"seed": 0, "actions": "444", "steps": 3, "progress": 1.5, "return": 2.0, "edge": ""}
+    ended = [("goal", ""), ("left", "far"), ("left", "side"), ("crash", ""), ("time", "")]
+    table = measure(
+        [flight | {"outcome": o, "edge": e, "steps": i} for i, (o, e) in enumerate(ended)]
+    )
+    assert table["steps"].tolist() == [0, 1, 2, 3, 4]
+    assert (table["progress"] == 1.5).all()
+    assert (table["return"] == 2.0).all()
+    assert table["crossed"].tolist() == [1, 1, 0, 0, 0]
+    shares = {o: table[o].mean() for o in ("goal", "left", "crash", "time")}
+    assert shares == {"goal": 0.2, "left": 0.4, "crash": 0.2, "time": 0.2}
 
 
 # -------------------------------------------------- whatever the world, whatever the actions

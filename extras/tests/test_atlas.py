@@ -2,9 +2,8 @@
 
 import pytest
 
-from deepflight import fly, straight_pilot
-from env import World, grid
-from extras.atlas import cause, forest
+from env import World, fly, grid, straight_pilot
+from extras.experiments.atlas import cause, forest
 
 
 def test_density_1_at_5_metres_a_second_is_the_papers_forest() -> None:
@@ -20,6 +19,6 @@ def test_trunks_grow_in_number_with_density_on_the_same_ground(density: float) -
 
 
 def test_who_flies_straight_into_a_trunk_has_seen_it_and_could_have_turned() -> None:
-    for flight in fly("straight", straight_pilot, range(10), World(), camera=False):
+    for flight in fly(straight_pilot, range(10), World(), camera=False):
         assert flight["outcome"] == "crash"
         assert cause(flight, World()) in ("careless", "trapped")

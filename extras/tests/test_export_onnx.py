@@ -5,16 +5,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from deepflight import load_weights
-from dqn import greedy
+from dqn import greedy, load_weights
 from env import World
-from extras.export_onnx import STATES, export, parity, session, states
-
-ROOT = Path(__file__).parent.parent.parent
+from extras.bridges.export_onnx import ROOT, STATES, export, parity, session, states
 
 
 def test_on_a_thousand_states_the_export_gives_torch_s_values_and_actions(tmp_path: Path) -> None:
-    q = load_weights(ROOT / "weights/paper.pt", beacon=False)
+    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False)
     export(q, tmp_path / "paper.onnx")
     report = parity(q, session(tmp_path / "paper.onnx"), states(q, World(), STATES))
     assert report["relative error"] <= 1e-4
@@ -22,7 +19,7 @@ def test_on_a_thousand_states_the_export_gives_torch_s_values_and_actions(tmp_pa
 
 
 def test_parity_sees_another_network(tmp_path: Path) -> None:
-    q = load_weights(ROOT / "weights/paper.pt", beacon=False)
+    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False)
     export(q, tmp_path / "paper.onnx")
     with torch.no_grad():
         q.head[2].bias[0] += 1
@@ -31,7 +28,7 @@ def test_parity_sees_another_network(tmp_path: Path) -> None:
 
 
 def test_any_batch_will_do(tmp_path: Path) -> None:
-    q = load_weights(ROOT / "weights/paper.pt", beacon=False)
+    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False)
     export(q, tmp_path / "paper.onnx")
     run = session(tmp_path / "paper.onnx")
     for size in (1, 7):

@@ -12,7 +12,7 @@ from gymnasium.wrappers import RecordVideo, TimeLimit
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from env import ForestEnv
-from extras.gym_env import ID, Forest
+from extras.bridges.gym_env import ID, Forest
 
 
 @pytest.mark.parametrize("check", [check_env, check_env_sb3])

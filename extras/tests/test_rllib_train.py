@@ -7,8 +7,10 @@ import ray
 import torch
 
 import deepflight
-from deepflight import Config, load_weights
-from extras.rllib_train import make_config, start, train
+from deepflight import RunConfig
+from dqn import DQNConfig, load_weights, make_optimizer
+from env import World
+from extras.bridges.rllib_train import make_config, start, train
 
 pytestmark = pytest.mark.long
 
@@ -17,12 +19,13 @@ def test_two_runners_train_a_network_that_flies(tmp_path: Path) -> None:
     out = tmp_path / "rllib.pt"
     start(None)
     try:
-        train(Config(steps=2000, warmup=200), runners=2, out=out)
+        train(DQNConfig(steps=2000, learning_starts=200), RunConfig(), runners=2, out=out)
         other = tmp_path / "untrained.pt"
-        train(Config(steps=1000, warmup=5000), runners=2, out=other)
+        train(DQNConfig(steps=1000), RunConfig(), runners=2, out=other)
     finally:
         ray.shutdown()
-    trained, untrained = (load_weights(path, beacon=False).state_dict() for path in (out, other))
+    saved = (load_weights(path, World.actions, beacon=False) for path in (out, other))
+    trained, untrained = (q.state_dict() for q in saved)
     assert not torch.equal(trained["head.2.bias"], untrained["head.2.bias"]), "it learnt nothing"
     fly = ["eval", "--weights", str(out), "--episodes", "2", "--pilots", "dqn"]
     assert deepflight.main([*fly, "--out", str(tmp_path)]) == 0
@@ -32,7 +35,9 @@ def test_two_runners_train_a_network_that_flies(tmp_path: Path) -> None:
 def test_one_batch_is_learnt_every_four_steps_whatever_the_runners(runners: int) -> None:
     from ray.rllib.algorithms.dqn.dqn import calculate_rr_weights
 
-    config = make_config(Config(), runners)
+    config = make_config(DQNConfig(), RunConfig(), runners)
     flown = config.rollout_fragment_length * config.num_envs_per_env_runner * runners  # a round
     sampled, learnt = calculate_rr_weights(config)
-    assert learnt / (sampled * flown) == pytest.approx(1 / Config.update_every)
+    assert learnt / (sampled * flown) == pytest.approx(1 / DQNConfig.update_every)
+    ours = make_optimizer([torch.zeros(1)], DQNConfig())
+    assert config.adam_epsilon == ours.defaults["eps"]

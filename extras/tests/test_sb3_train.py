@@ -7,16 +7,17 @@ import pytest
 import torch
 
 import deepflight
-from deepflight import Config, save_weights
+from deepflight import RunConfig
+from dqn import DQNConfig, make_optimizer, save_weights
 from env import World
-from extras.export_onnx import states
-from extras.sb3_train import convert, make_model
+from extras.bridges.export_onnx import states
+from extras.bridges.sb3_train import ADAM_EPSILON, convert, make_model
 
 pytestmark = pytest.mark.long
 
 
 def test_the_converted_network_has_the_trained_ones_values_and_flies(tmp_path: Path) -> None:
-    model = make_model(Config(steps=400, warmup=200), replay=800)
+    model = make_model(DQNConfig(steps=400, learning_starts=200), RunConfig(), replay=800)
     before = convert(model).state_dict()["conv.0.weight"].clone()
     model.learn(400)
     q = convert(model)
@@ -33,11 +34,13 @@ def test_the_converted_network_has_the_trained_ones_values_and_flies(tmp_path: P
 
 
 def test_the_settings_are_ours() -> None:
-    c = Config()
-    model = make_model(c, replay=800)
+    c = DQNConfig()
+    model = make_model(c, RunConfig(), replay=800)
     assert model.gradient_steps / model.n_envs == 1 / c.update_every
     assert model.target_update_interval == c.target_every * c.update_every
-    assert (model.batch_size, model.gamma, model.n_steps) == (c.batch, c.gamma, c.n)
-    assert [model.lr_schedule(left) for left in (1, 0)] == pytest.approx([c.lr, c.lr_final])
+    assert (model.batch_size, model.gamma, model.n_steps) == (c.batch_size, c.gamma, c.n_steps)
+    assert [model.lr_schedule(left) for left in (1, 0)] == pytest.approx([c.lr, c.lr * c.lr_decay])
     eps = [model.exploration_schedule(1 - step / c.steps) for step in (0, c.epsilon_decay, c.steps)]
     assert eps == pytest.approx([1, c.epsilon_final, c.epsilon_final])
+    ours = make_optimizer(model.q_net.parameters(), c)
+    assert model.policy.optimizer.defaults["eps"] == ADAM_EPSILON == ours.defaults["eps"]

@@ -1,0 +1,113 @@
+"""Export a trained network to ONNX, for where there is no torch: the paper's next step was a drone.
+
+    extras/.venv/bin/pip install -r extras/requirements.txt
+    extras/.venv/bin/python -m extras.bridges.export_onnx      # weights/paper.pt -> runs/paper.onnx
+
+Input `observation` (B, 4, 84, 84) uint8, output `q` (B, 9) float32, any B; the action is the
+argmax. The script then flies forests from the first evaluation seed on, half of them at random, and
+holds the export against torch on 1,000 of the states met; last it times a single decision in both,
+on one thread. A control step lasts 100 ms. What it times is this machine's processor, not a Jetson.
+"""
+
+import argparse
+import json
+import logging
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import torch
+from numpy import ndarray
+
+from deepflight import EVAL_FIRST
+from dqn import QNetwork, greedy, load_weights
+from env import ForestEnv, World
+
+ROOT, STATES = Path(__file__).parents[2], 1000
+WARMUP, CALLS = 50, 1000  # decisions before and in a timing
+
+
+def export(q: QNetwork, path: Path) -> None:
+    """Write the network as one ONNX file, its weights inside."""
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, we do not
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # torch warns of itself
+        program = torch.onnx.export(
+            q.eval(),
+            (torch.zeros(2, 4, 84, 84, dtype=torch.uint8),),
+            dynamo=True,
+            verbose=False,
+            input_names=["observation"],
+            output_names=["q"],
+            dynamic_shapes=({0: torch.export.Dim("batch")},),
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    program.save(path, external_data=False)
+
+
+def session(path: Path) -> onnxruntime.InferenceSession:
+    """onnxruntime on one thread."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+
+def states(q: QNetwork, world: World, count: int) -> ndarray:
+    """States (count, 4, 84, 84) uint8 of flights by the network and by chance in turn."""
+    env, rng, seen, seed = ForestEnv(world), np.random.default_rng(0), [], EVAL_FIRST
+    while len(seen) < count:
+        s, _ = env.reset(seed=seed)
+        while not env.outcome:
+            seen.append(s)
+            a = rng.integers(world.actions) if seed % 2 else greedy(q, s[None])[0]
+            s = env.step(int(a))[0]
+        seed += 1
+    return np.stack(seen[:count])
+
+
+def parity(q: QNetwork, run: onnxruntime.InferenceSession, s: ndarray) -> dict[str, float]:
+    """Largest difference over the largest value of its state, and the share of equal actions."""
+    with torch.no_grad():
+        ours = q(torch.from_numpy(s)).numpy()  # (N, 9)
+    theirs = run.run(None, {"observation": s})[0]  # (N, 9)
+    error = np.abs(theirs - ours).max(1) / np.abs(ours).max(1)  # (N,)
+    same = theirs.argmax(1) == ours.argmax(1)  # (N,)
+    return {"relative error": float(error.max()), "same action": float(same.mean())}
+
+
+def latency(decide: Callable[[ndarray], object], s: ndarray) -> dict[str, float]:
+    """Median and 99th percentile of one decision, ms; s (N, 4, 84, 84)."""
+    times = []
+    for i in range(WARMUP + CALLS):
+        one = s[i % len(s)][None]  # (1, 4, 84, 84)
+        start = time.perf_counter()
+        decide(one)
+        times.append(1000 * (time.perf_counter() - start))
+    p50, p99 = np.percentile(times[WARMUP:], [50, 99])
+    return {"p50": float(p50), "p99": float(p99)}
+
+
+def main() -> None:
+    """Export, compare, time."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--weights", type=Path, help="default: weights/paper.pt or beacon.pt")
+    parser.add_argument("--beacon", action="store_true", help="the world with the visible goal")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    shipped = ROOT / f"weights/{'beacon' if args.beacon else 'paper'}.pt"
+    weights = args.weights or shipped
+    q = load_weights(weights, World.actions, beacon=args.beacon)
+    path = Path("runs") / f"{weights.stem}.onnx"
+    export(q, path)
+    run, s = session(path), states(q, World(beacon=args.beacon), STATES)
+    report = parity(q, run, s)
+    report["onnxruntime, ms"] = latency(lambda one: run.run(None, {"observation": one}), s)
+    report["torch, ms"] = latency(lambda one: greedy(q, one), s)
+    print(f"wrote {path}, {path.stat().st_size / 1e6:.1f} MB\n{json.dumps(report, indent=1)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""Ours and the peers in one run, turn by turn. Ratios, because seconds differ between machines.
+
+    sudo apt-get install xvfb libgl1 libglu1-mesa libgl1-mesa-dri     # MiniWorld draws by OpenGL
+    extras/.venv/bin/pip install -r extras/requirements.txt
+    xvfb-run -a extras/.venv/bin/python -m extras.experiments.bench   # leave the machine alone
+
+(a) environment steps with their frame, resets included, one core, random actions. Ours: eight
+    drones side by side, as in training, and one alone. ViZDoom at 160x120, in an empty maze and
+    among monsters; MiniWorld at 84x84, in an empty hallway and in a room strewn with things;
+(b) training steps: Stable-Baselines3's DQN, plain 1-step DQN both, the same network, batch,
+    updates, threads and 8 environments: float32 both, then our default precision;
+(c) bytes that a transition takes in the replay, by its arrays;
+(d) growth: a step among 150, 1,500 and 15,000 trunks, equally dense, resets not counted, one core.
+
+A figure is the median of five rounds, a ratio the median of the rounds' ratios. Writes
+results/bench.json and prints the README's table. The runners are in peers.py.
+"""
+
+import json
+import os
+import re
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import torch
+
+from dqn import HAS_BFLOAT16, Replay
+from env import ForestEnv, World
+from extras.bridges.sb3_train import make_model
+from extras.experiments.peers import (
+    DRONES,
+    PLAIN,
+    REPLAY,
+    RNG,
+    RUN,
+    doom,
+    forest,
+    forest_alone,
+    rooms,
+    sb3,
+    training,
+)
+
+ROOT, ROUNDS, SECONDS = Path(__file__).parents[2], 5, 4.0
+LONG = {"length": 900.0, "rows": 150}
+WIDE = LONG | {"width": 500.0, "columns": 100, "first_y": -247.0}
+FORESTS = {"150": {}, "1,500": LONG, "15,000": WIDE}  # trunks -> the world
+OURS = {"eight side by side": forest, "one alone": forest_alone}
+SCENES = {  # of the peers, the emptiest first
+    "ViZDoom, my_way_home": partial(doom, "my_way_home"),
+    "ViZDoom, deathmatch": partial(doom, "deathmatch"),
+    "MiniWorld, Hallway": partial(rooms, "Hallway"),
+    "MiniWorld, CollectHealth": partial(rooms, "CollectHealth"),
+}
+Jobs = dict[str, Callable[[], float]]  # a name -> what gives its steps a second
+Given = dict[str, list[float]]  # a job's name -> what it gave, round by round
+
+
+def rate(steps: Iterator[int]) -> float:
+    """Steps a second."""
+    next(steps)
+    done, start = 0, time.perf_counter()
+    while time.perf_counter() - start < SECONDS:
+        done += next(steps)
+    return done / (time.perf_counter() - start)
+
+
+def flight_rate(env: ForestEnv) -> float:
+    """Steps a second, the resets not counted."""
+    done, spent = 0, 0.0
+    while spent < SECONDS / 3:
+        env.reset()
+        start = time.perf_counter()
+        while not env.outcome:
+            env.step(int(RNG.integers(9)))
+        spent += time.perf_counter() - start
+        done += len(env.actions)
+    return done / spent
+
+
+def turns(jobs: Jobs) -> Given:
+    """Every job in turn, ROUNDS times."""
+    given: Given = {name: [] for name in jobs}
+    for _ in range(ROUNDS):
+        for name, job in jobs.items():
+            given[name].append(job())
+            print(f"{name:>40} {given[name][-1]:14,.1f}", flush=True)
+    return given
+
+
+def ratio(given: Given, a: str, b: str) -> float:
+    """The median over the rounds of a's figure over b's."""
+    return median(x / y for x, y in zip(given[a], given[b], strict=True))
+
+
+def replay_bytes() -> dict[str, float]:
+    """Of a transition, by the arrays of each replay."""
+    theirs = vars(make_model(PLAIN, RUN, 800).replay_buffer).values()
+    replays = {"ours": (REPLAY, vars(Replay(REPLAY, DRONES)).values()), "sb3": (800, theirs)}
+    return {
+        name: sum(x.nbytes for x in arrays if isinstance(x, np.ndarray)) / size
+        for name, (size, arrays) in replays.items()
+    }
+
+
+def on_one_core() -> tuple[Given, Given]:
+    """(a) and (d); a game started from here inherits the one core."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    a = turns({name: partial(rate, runner()) for name, runner in (OURS | SCENES).items()})
+    worlds = {f"{n} trunks": ForestEnv(World(**world)) for n, world in FORESTS.items()}
+    d = turns({name: partial(flight_rate, env) for name, env in worlds.items()})
+    os.sched_setaffinity(0, cores)
+    return a, d
+
+
+def main() -> None:
+    """Run it all, write it, print it."""
+    torch.set_num_threads(RUN.threads)
+    torch.set_flush_denormal(True)  # as our training does, for Stable-Baselines3 too
+    (a, d), step, train = on_one_core(), "time of a step:", "training steps a second: ours"
+    ours = {f"ours, bfloat16 {x}": partial(training, x) for x in sorted({False, HAS_BFLOAT16})}
+    b, c = turns({"sb3": partial(rate, sb3()), **ours}), replay_bytes()
+    figures = {
+        f"environment steps a second: ours, {way} / {x}": ratio(a, way, x)
+        for way in OURS
+        for x in SCENES
+    }
+    figures[f"{train} / Stable-Baselines3's, float32 both"] = ratio(
+        b, "ours, bfloat16 False", "sb3"
+    )
+    if HAS_BFLOAT16:
+        other = ratio(b, "ours, bfloat16 True", "sb3")
+        figures[f"{train} in bfloat16 / Stable-Baselines3's"] = other
+    figures |= {
+        "replay bytes a transition: Stable-Baselines3's default / ours": c["sb3"] / c["ours"],
+        f"{step} 1,500 / 150 trunks": ratio(d, "150 trunks", "1,500 trunks"),
+        f"{step} 15,000 / 150 trunks": ratio(d, "150 trunks", "15,000 trunks"),
+    }
+    rates = {name: median(x) for part in (a, b, d) for name, x in part.items()}
+    cpu = re.search("model name.*: (.*)", Path("/proc/cpuinfo").read_text())[1]
+    report = {"machine": cpu, "torch": torch.__version__, "threads": RUN.threads}
+    report |= {"figures": figures, "rates": rates, "bytes": c}
+    (ROOT / "results/bench.json").write_text(json.dumps(report, indent=1) + "\n")
+    print("\n".join(f"| {name} | {figure:.2f} |" for name, figure in figures.items()))
+
+
+if __name__ == "__main__":
+    main()
