@@ -1,43 +1,50 @@
-"""dqn.py: the brain. Deep Q-learning [Mnih15], which knows no forest, from the first word on.
+"""dqn.py: the brain. Deep Q-learning (DQN), the algorithm of [Mnih15].
 
-The words, for this drone:
-  state s       what the drone knows: its last four pictures
-  action a      one of nine yaw rates, chosen ten times a second
-  reward r      one number a step, good or bad (env.py has the table)
-  transition    one step of experience: state s, action a, reward r, next state s2
-  return        the sum of the rewards to come. A reward k steps away counts gamma^k times as much
-  discount      gamma = 0.99. Three rewards 1, 1, -10 and then the end: the return is
-                1 + 0.99 * 1 + 0.99^2 * -10 = 1 + 0.99 - 9.80 = -7.81
+The words, for this drone
+    state s       what the drone knows: its last four pictures
+    action a      one of nine yaw rates, chosen ten times a second
+    reward r      one number a step, good or bad
+    transition    one step of experience: state s, action a, reward r, next state s2
+    return        all rewards to come, added up; a reward k steps away counts gamma^k times
+    gamma         the discount, 0.99. Three rewards 1, 1, -10 and then the end: the return is
+                  1 + 0.99 * 1 + 0.99^2 * -10 = 1 + 0.99 - 9.80 = -7.81
 
-Q(s, a) is the expected return of a flight that is in state s, takes action a, and takes the best
-actions from then on. "Expected" means the average over all that the drone cannot know, such as the
-trunks behind the next one. Who knows Q can fly: take the action whose Q is greatest. So a network
-learns Q. Four pictures go in. Nine numbers come out, one for each action.
+Q(s, a) is the expected return of a drone that takes action a in state s, and the best action in
+every later state. "Expected" means the average over all that the drone cannot know, such as the
+trunks behind the next one. A drone that knows Q can fly: it takes the action whose Q is greatest.
 
-A network learns from pairs of an input and a label. Nobody has the labels, but every transition
-makes one. The return from s is r plus gamma times the return from s2, so the label of Q(s, a) is
+A neural network learns Q. It is a function with 1.7 million adjustable numbers, its weights. Four
+pictures go in. Nine numbers come out, one for each action. It learns from examples, each an input
+with a label: the number that should have come out. Nobody has the labels. But the return from s is
+r plus gamma times the return from s2, so every transition makes a label y for Q(s, a):
 
-    y = r + gamma * max over a2 of Q(s2, a2)        (at the end of a flight: y = r)
+    y = r + gamma * max over a2 of Q(s2, a2)        at the end of a flight: y = r
 
-In numbers: r = 0.5, and the best of the nine values of Q(s2, .) is 10. Then y is 0.5 + 0.99 * 10 =
-10.4. If the network says Q(s, a) = 8, it is wrong by 2.4, and one gradient step moves it a little
-towards 10.4. Such a label is called a TD target; the equation is Bellman's.
+In numbers: r = 0.5, and the greatest of the nine values Q(s2, .) is 10. Then y = 0.5 + 0.99 * 10 =
+10.4. If Q(s, a) is 8, it is wrong by 2.4. A gradient step changes every weight a little, in the
+direction that makes this error smaller. Now Q(s, a) is perhaps 8.1. The label is called the TD
+target (for temporal difference), and the equation is Bellman's.
 
-How can a network learn from labels that it makes itself? Because each label holds one true reward.
-Where a flight ends, the whole label is true: -10 for a crash. Once that is learnt, the state one
-step earlier gets a better label, then the state two steps earlier, and so on: the truth moves
-backwards through the flight. Three things can go wrong, and DQN has an answer to each:
+How can a network learn from labels that it makes itself? Each label holds one true reward, and at
+the end of a flight the whole label is true. Take three steps with rewards 0.5, 0.5, -10, and a Q
+that is 0 everywhere. If every update went all the way to its label, Q of the three would be
+
+    after update 1       0.5       0.5     -10      the crash is known
+    after update 2       1.0      -9.4     -10      0.5 + 0.99 * -10 = -9.4
+    after update 3      -8.8      -9.4     -10      0.5 + 0.99 * -9.4 = -8.8: all three are true
+
+The truth moves backwards through the flight. Three things can go wrong. DQN has an answer to each:
 
   * Pictures that follow each other look alike. A network that learns from them in that order
-    forgets the rest. So the drone keeps its transitions in a **replay** memory, and each update
-    learns from a few of them, drawn at random.
-  * Each update moves the labels too, and the network may chase its own tail. So the labels come
-    from a **target network** Q^, a copy of Q that is renewed only now and then.
+    forgets the rest. So a **replay** memory keeps the transitions, and each update learns from a
+    few of them, drawn at random.
+  * Each update of Q moves the labels too, so the network chases its own tail. So the labels come
+    from a **target network** Q^: a copy of Q that is renewed only now and then.
   * A drone that always does what seems best never finds out what is better. So it **explores**:
     with probability epsilon it takes a random action, at first always, later rarely.
 
 Algorithm 1 of [Mnih15], "Human-level control through deep reinforcement learning", Nature 518. The
-code carries these numbers; `train` in deepflight.py has all of them, in order, on one screen.
+code carries these numbers. `train` in deepflight.py has all of them on one screen.
 
      1  initialize replay memory D to capacity N
      2  initialize action-value function Q with random weights theta
@@ -58,23 +65,32 @@ code carries these numbers; `train` in deepflight.py has all of them, in order, 
     16      end for
     17  end for
 
+In our words: an episode is a flight, the emulator is env.py, x is a picture, phi_t is the stack of
+four pictures that we call s, and theta are the weights.
+
+PyTorch in five lines
+    q(s)               calls QNetwork.forward; a tensor is an array that remembers how it was made
+    torch.no_grad()    do not remember: nothing here is to be learnt from
+    loss.backward()    for every weight, find which way the loss grows
+    optimizer.step()   move every weight a little the other way
+    q.gather(1, a)     in NumPy: q[arange(len(q)), a]
+
 A mark like [+double] means: not in the textbook. The name is the setting that switches it off.
 
 Legend
     s, a      state and action
-    r         reward; in a batch the discounted sum of the next n_steps rewards [+n_steps]
+    r         reward; in a batch the discounted sum of n_steps rewards [+n_steps]
     s2        the state after r
-    gamma     the discount of one step
-    discount  that of s2: gamma to the number of rewards in r
-    end       LIVE, TRUNCATED or TERMINAL
+    gamma_n   the discount of s2: gamma to the number of rewards in r
+    end       how a transition ended: LIVE, TRUNCATED or TERMINAL
     y         the label, or TD target
     Q, Q^     the network that learns, and the target network
     B         transitions in a batch
     A         actions
-    L         drones that fly side by side, one lane of the replay each
+    L         drones that fly side by side; each has a lane of the replay
     T         rows of the replay
 
-Not in this file: prioritized replay, distributional values, noisy layers.
+Not in this file: the forest, prioritized replay, distributional values, noisy layers.
 """
 
 import hashlib
@@ -93,16 +109,14 @@ from numpy.random import Generator
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-# How a transition ended: not at all; by a time limit, so that the world would have gone on; or in
-# the world itself, so that no reward can follow.
+# How a transition ended: not at all; by the clock alone, so more rewards would have followed; or in
+# the world itself, so none can follow. env.py tells more.
 LIVE, TRUNCATED, TERMINAL = range(3)
 
 
 def setting(value: Any, text: str, low: float, high: float = np.inf) -> Any:
     """One field of the settings: its default, a text with unit and source, and what is allowed."""
-    return field(
-        default=value, metadata={"help": f"{text} (default: {value})", "legal": (low, high)}
-    )
+    return field(default=value, metadata=dict(help=f"{text} (default: {value})", legal=(low, high)))
 
 
 @dataclass(frozen=True)
@@ -122,13 +136,13 @@ class DQNConfig:
     adam: bool = setting(True, "[+] Adam; --no-adam: RMSprop", 0, 1)
     num_envs: int = setting(8, "[+] drones that fly side by side; 1: off", 1, 1000)
     double: bool = setting(True, "[+] Double DQN [van Hasselt 2016]; --no-double: off", 0, 1)
-    n_steps: int = setting(5, "[+] rewards in a label before the bootstrap; 1: off", 1, 100)
+    n_steps: int = setting(5, "[+] true rewards in a label; 1: off", 1, 100)
     mirror: bool = setting(True, "[+] reflect half of every batch; --no-mirror: off", 0, 1)
-    huber: float = setting(100.0, "[+] larger errors pull no harder; 1: Mnih's", 1e-3, 1e6)
-    huber_after: int = setting(100_000, "[+] control steps with Mnih's 1 before that", 0)
+    huber: float = setting(100.0, "[+] errors above it pull no harder; 1: Mnih's", 1e-3, 1e6)
+    huber_after: int = setting(100_000, "[+] control steps with Mnih's 1, then huber", 0)
     lr_decay: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
     max_grad_norm: float = setting(10.0, "[+] longer gradients are cut to this; 0: off", 0)
-    average: float = setting(0.1, "[+] last share of the steps: the mean of Q flies; 0: off", 0, 1)
+    average: float = setting(0.1, "[+] last share of the steps, averaged to fly; 0: off", 0, 1)
     bfloat16: bool = setting(True, "[+] quick convolutions if the CPU has it; --no-bfloat16", 0, 1)
 
 
@@ -136,9 +150,12 @@ class DQNConfig:
 
 
 class QNetwork(nn.Module):
-    """The Nature network [Mnih15, Methods]. Its output is linear, because values may be negative.
+    """The network of [Mnih15, Methods]. Its last layer is linear, because values may be negative.
 
-    frames (4, 84, 84) -> conv 32 8x8/4 -> conv 64 4x4/2 -> conv 64 3x3/1 -> 512 -> Q(s, .) (A,)
+    pictures (4, 84, 84) -> conv 32 8x8/4 -> conv 64 4x4/2 -> conv 64 3x3/1 -> 512 -> Q(s, .) (A,)
+
+    conv 32 8x8/4: 32 small filters of 8x8 pixels slide over the picture in strides of 4 pixels, and
+    each answers strongly where it finds its pattern.
     """
 
     def __init__(self, actions: int) -> None:
@@ -154,8 +171,9 @@ class QNetwork(nn.Module):
     def forward(self, s: Tensor, bfloat16: bool = False) -> Tensor:
         """Q(s, .) (B, A) float32 of s (B, 4, 84, 84) uint8.
 
-        [+bfloat16] Half as many bits make the convolutions quicker. The last layers stay float32:
-        between 64 and 128 bfloat16 moves in steps of 0.5, and the actions would tie.
+        [+bfloat16] Numbers of half as many bits make the convolutions quicker. The last layers stay
+        float32: values near 100 are common here, bfloat16 has only steps of 0.5 there, and actions
+        would tie.
         """
         with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
             seen = self.conv(s.float() / 255)  # (B, 3136)
@@ -168,16 +186,16 @@ def greedy(q: QNetwork, s: ndarray) -> ndarray:
     return q(torch.from_numpy(s)).argmax(1).numpy()
 
 
-def td_target(r: Tensor, discount: Tensor, end: Tensor, q2: Tensor, q2_online: Tensor) -> Tensor:
+def td_target(r: Tensor, gamma_n: Tensor, end: Tensor, q2: Tensor, q2_online: Tensor) -> Tensor:
     """The label y (B,) of line 13: r + gamma * max_a2 Q^(s2, a2), or r where the world ended.
 
-    r, discount, end (B,). q2 (B, A): Q^(s2, .). q2_online (B, A): the values that choose a2.
-    The textbook lets Q^ choose, so both are Q^. Only TERMINAL stops the sum: a time limit ends the
-    flight, but not the world.
+    r, gamma_n, end (B,). q2 (B, A): Q^(s2, .), which says what an action is worth. q2_online
+    (B, A): the values by which the best action is chosen; in the textbook these are q2 too. Only
+    TERMINAL stops the sum: a time limit ends the flight, but not the world.
     """
     a2 = q2_online.argmax(1, keepdim=True)  # (B, 1)
-    v2 = q2.gather(1, a2)[:, 0]  # (B,)
-    return r + discount * torch.where(end == TERMINAL, 0.0, v2)
+    v2 = q2.gather(1, a2)[:, 0]  # (B,) in NumPy: q2[arange(B), a2]
+    return r + gamma_n * torch.where(end == TERMINAL, 0.0, v2)
 
 
 class Batch(NamedTuple):
@@ -187,20 +205,23 @@ class Batch(NamedTuple):
     a: ndarray  # (B,) int64
     r: ndarray  # (B,) float32
     s2: ndarray  # (B, 4, 84, 84) uint8, meaningless after TERMINAL
-    discount: ndarray  # (B,) float32
+    gamma_n: ndarray  # (B,) float32
     end: ndarray  # (B,) uint8
 
 
 class Replay:
-    """The last transitions of L environments that step together (line 1).
+    """The last transitions of L drones that fly side by side (line 1).
 
     Each picture is kept once, 7,056 bytes, and a state is put together from four of them when it is
     drawn. To keep s and s2 whole would cost eight times as much. Row t, lane l holds the newest
-    picture of s_t in environment l, the action taken there, its reward and how it ended.
+    picture of s_t of drone l, the action taken there, its reward and how it ended.
 
         lane 0   x x x|x x x x x x x x           | a flight's end: no stack and no
         lane 1   x x x x x x x|x x x x             n-step window reaches across it,
                              ^ write position      nor across the write position
+
+    The s2 of a transition is the state of the next row. Only a truncated flight has a last state
+    that no row holds, so `last_frames` keeps its newest picture.
     """
 
     def __init__(self, capacity: int, lanes: int) -> None:
@@ -209,7 +230,7 @@ class Replay:
         self.actions = np.zeros(shape, np.uint8)  # (T, L)
         self.rewards = np.zeros(shape, np.float32)  # (T, L)
         self.ends = np.zeros(shape, np.uint8)  # (T, L)
-        self.last_frames: dict[tuple[int, int], ndarray] = {}  # of s2, for TRUNCATED alone
+        self.last_frames: dict[tuple[int, int], ndarray] = {}  # (row, lane) -> (84, 84)
         self.rows, self.lanes = shape
         self.added = 0  # rows ever written
 
@@ -225,8 +246,11 @@ class Replay:
         self.added += 1
 
     def sample(self, size: int, n: int, gamma: float, rng: Generator) -> Batch:
-        """Draw transitions uniformly (line 12) from all but the oldest three rows, which may have
-        lost the pictures before them, and the newest n, which wait for the rewards after them."""
+        """Draw transitions uniformly (line 12).
+
+        Not the oldest three rows: the pictures that their stacks need may be overwritten. Not the
+        newest n rows: the rewards that their sums need are still to come.
+        """
         oldest = max(self.added - self.rows, 0) + 3
         row = rng.integers(oldest, self.added - n, size) % self.rows  # (B,)
         lane = rng.integers(self.lanes, size=size)  # (B,)
@@ -235,12 +259,13 @@ class Replay:
     def window(self, row: ndarray, lane: ndarray, n: int, gamma: float) -> Batch:
         """The transitions that start at row (B,), lane (B,), each over n steps.
 
-        [+n_steps] The label of n steps is r_0 + gamma * r_1 + ... + gamma^n * max Q^(s_n, .). A
-        crash is then felt n states earlier at once, and not one state an update.
+        [+n_steps] With n = 2 the label is r_0 + gamma * r_1 + gamma^2 * max Q^(s_2, .): two true
+        rewards, then the estimate. So the truth moves n states backwards with each update, and not
+        one. A window that meets the end of a flight stops there.
         """
         last, r, power = row, self.rewards[row, lane], np.ones(len(row), np.float32)  # (B,)
         for _ in range(n - 1):
-            live = self.ends[last, lane] == LIVE  # (B,)
+            live = self.ends[last, lane] == LIVE  # (B,) the flight goes on: take one more step
             last = np.where(live, (last + 1) % self.rows, last)  # (B,)
             power = np.where(live, power * np.float32(gamma), power)  # (B,)
             r = r + live * power * self.rewards[last, lane]  # (B,)
@@ -266,8 +291,8 @@ class Replay:
 def mirror(batch: Batch, actions: int, rng: Generator) -> Batch:
     """[+mirror] Reflect half of the transitions: pictures left to right, a -> A - 1 - a.
 
-    Flight, reward and camera are symmetric, so the reflection is another true transition for free.
-    Only the forest's grid is not quite: it stands 0.5 m off centre.
+    Flight, reward and camera are symmetric, so the reflection is one more true transition, for
+    free. Only the forest's grid is not quite symmetric: it stands 0.5 m off centre.
     """
     flip = rng.random(len(batch.a)) < 0.5  # (B,)
     for frames in (batch.s, batch.s2):
@@ -291,9 +316,9 @@ class Agent(nn.Module):
     def __init__(self, c: DQNConfig, actions: int, seed: int) -> None:
         super().__init__()
         self.updates, self.loss, self.bfloat16 = 0, torch.zeros(()), c.bfloat16 and HAS_BFLOAT16
-        layout = torch.channels_last  # in memory: it spares float32 a fifth of its time
-        with torch.random.fork_rng():  # torch draws initial weights from its global generator:
-            torch.manual_seed(seed % 2**64)  # lend it our seed and put its own state back
+        layout = torch.channels_last  # the order in memory in which convolutions are quickest
+        with torch.random.fork_rng():  # torch draws the first weights from its own generator:
+            torch.manual_seed(seed % 2**64)  # lend it our seed, then put its state back
             self.q = QNetwork(actions).to(memory_format=layout)  # line 2
             self.q_target = QNetwork(actions).to(memory_format=layout)
         self.q_target.load_state_dict(self.q.state_dict())  # line 3
@@ -301,28 +326,29 @@ class Agent(nn.Module):
         self.optimizer = make_optimizer(self.q.parameters(), c)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What state_dict holds besides weights."""
+        """What a checkpoint needs besides weights; PyTorch's state_dict calls this."""
         return {"optimizer": self.optimizer.state_dict(), "updates": self.updates}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take it up again."""
+        """Take it up again; PyTorch's load_state_dict calls this."""
         self.optimizer.load_state_dict(state["optimizer"])
         self.updates = state["updates"]
 
 
 def make_optimizer(theta: Any, c: DQNConfig) -> torch.optim.Optimizer:
-    """[+adam] Adam, or an RMSprop after [Mnih15], for the weights theta."""
+    """[+adam] Adam gives each weight a stride of its own and needs little tuning. Without it: an
+    RMSprop after [Mnih15]. theta: the weights."""
     if c.adam:
         return torch.optim.Adam(theta, c.lr, eps=1.5e-4, fused=True)
-    return torch.optim.RMSprop(theta, c.lr, 0.95, 0.01, momentum=0.95, centered=True)
+    return torch.optim.RMSprop(theta, c.lr, alpha=0.95, eps=0.01, momentum=0.95, centered=True)
 
 
 # Where the processor has no bfloat16 of its own, float32 is quicker.
 HAS_BFLOAT16 = bool(torch.cpu.get_capabilities().get("avx512_bf16"))
-MACHINE = {"torch": str(torch.__version__), "bfloat16": HAS_BFLOAT16}  # on another, other bytes
+MACHINE = {"torch": str(torch.__version__), "bfloat16": HAS_BFLOAT16}  # another gives other bytes
 
 
-# -------------------------------------------------- files that are whole, or not there: skip this
+# -------------------------------------------------- files: skip this on a first reading
 
 
 def write_whole(path: Path, data: bytes) -> None:

@@ -10,30 +10,37 @@
         y = -25  +-----------------------------------------------+
                x = 0    x: start to goal, y: left, heading psi: counter-clockwise from x   x = 90
 
-The drone never slows down. Ten times a second it sees four pictures and picks one of nine yaw
-rates, 0 the sharpest right turn, 4 straight on, 8 the sharpest left turn. Each such step earns one
-number, the reward. It says how good that step was, and nothing else tells the drone what to do: to
-fly well is to collect as much reward as possible over a whole flight.
+The drone never slows down. Ten times a second it takes a picture, keeps the last four, and picks
+one of nine yaw rates: 0 is the sharpest right turn, 4 is straight on, 8 is the sharpest left turn.
+Each such step earns one number, the reward. It says how good the step was, and nothing else tells
+the drone what to do. To fly well is to collect much reward over a whole flight.
 
-    | every step                      | reward                                     | d_obs        |
-    |---------------------------------|--------------------------------------------|--------------|
-    | safe                            | r_safe = +0.25                             | > 2.0 m      |
-    | too close                       | r_neg = 0 falling to r_precrash = -5       | 2.0 - 0.75 m |
-    | and in both, the way to go      | r_goal = 1 - d_goal / d_max                |              |
-    | crash, or out at any d_obs      | r_crash = -10 and nothing else; the end    | < 0.75 m     |
-    | arrival, or out of time         | as on every live step; the end             | >= 0.75 m    |
+    | the step ends                        | the reward is                                       |
+    |--------------------------------------|-----------------------------------------------------|
+    | in the air, d_obs > 2.0 m            | r_safe + r_goal                                     |
+    | in the air, d_obs from 2.0 to 0.75 m | r_near + r_goal                                     |
+    | in a crash, d_obs < 0.75 m           | r_crash                                             |
+    | outside, beyond any edge             | r_crash                                             |
+    | at the goal, or out of time          | as in the air                                       |
+
+    r_safe = 0.25    r_crash = -10    r_goal = 1 - d_goal / d_max, 0 at the start and 1 at the goal
+    r_near falls in a straight line from r_neg = 0 at 2.0 m to r_precrash = -5 at 0.75 m
 
 One step in numbers: the drone is at x = 30 on the middle line, so d_goal = 60, and the nearest bark
 is 1.5 m away. That is too close: -5 * (2.0 - 1.5) / (2.0 - 0.75) = -2. A third of the way is made:
 1 - 60 / 90 = 0.33. The reward of the step is -1.67.
 
-A flight ends in one of two ways. It is **terminated** when the world itself ends it: by a crash, by
-arrival, or by leaving the forest. No reward can follow. It is **truncated** when only the clock
-ends it, after 1,000 steps: the drone was still flying, and more reward would have followed. Who
-learns from the flight must not confuse the two.
+This is the paper's reward. To leave by the far edge costs -10 too, although it is what a pilot that
+cannot see the goal should do. So the network is paid more than this: see `learner_reward` in
+deepflight.py.
 
-pymunk moves the drone and measures d_obs; render.py looks. A flight is a deterministic function of
-its seed and its actions: keep those two and you can fly it again, frame by frame (`refly`).
+A flight ends in one of two ways. It is **terminated** when the world itself ends it: by a crash, by
+arrival, or by leaving the forest. No more reward can follow. It is **truncated** when only the
+clock ends it, after 1,000 steps: the drone was still flying, and more reward would have followed.
+Whoever learns from the flight must not confuse the two.
+
+pymunk moves the drone and measures d_obs; render.py draws what it sees. A flight is a deterministic
+function of its seed and its actions. Keep those two and you can fly it again, picture by picture.
 
 Legend
     d_obs     m, from the drone's centre to the nearest bark, at most the laser's 20 m
@@ -41,13 +48,14 @@ Legend
     d_max     m, the forest's length
     psi       rad, the heading
     N         trunks
-    L         drones that fly side by side
-    F         drones that are in the air
+    L         drones that fly side by side, one in each lane
+    F         those of them that are in the air
     A         actions
     [DF]      the Deep Flight paper; "authors' simulator" is the code released with it
+    ours      a number that neither gives, chosen by us
 
-Not in this file: rotors, wind, inertia, altitude. `ForestEnv` has Gymnasium's signatures without
-needing gymnasium.
+Not in this file: rotors, wind, inertia, altitude. `ForestEnv` has the methods of a Gymnasium
+environment (the usual interface in this field) and does not need gymnasium.
 """
 
 import math
@@ -104,8 +112,8 @@ def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
     """The reward of one step, [DF §II-A] line by line.
 
     outcome: "" while in the air, else one of OUTCOMES. d_obs, d_goal in m.
-    The paper prints the middle case's inequality reversed; the authors' simulator computes r_goal
-    and forgets to add it. We follow the paper's text.
+    The paper prints the inequality of the middle case in reverse. The authors' simulator computes
+    r_goal and forgets to add it. We follow the paper's text.
 
     >>> reward("", 3.0, 45.0, World()), reward("", 0.75, 90.0, World())
     (0.75, -5.0)
@@ -152,7 +160,7 @@ class ForestEnv:
         self.bark = [pymunk.Circle(ground, radius) for _ in grid(self.world)]
         self.drone = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self.space.add(self.drone, *self.bark)
-        self.seed, self.outcome, self.actions = -1, "not reset", []
+        self.seed, self.outcome, self.actions = -1, "not reset", []  # it counts as landed
 
     def reset(self, *, seed: int | None = None, options: object = None) -> tuple[ndarray, dict]:
         """Plant forest number `seed`, or the one after the last, and stand at the start.
@@ -170,7 +178,7 @@ class ForestEnv:
         forward (x gained in this step) in m, the pose (x, y, heading), and at the end the outcome,
         the edge that the drone left by, and the progress.
         """
-        r = self.fly(action)
+        r = self.advance(action)
         self.observation = np.concatenate([self.observation[1:], look([self])])  # (4, 84, 84)
         return self.observation, r, self.terminated, self.truncated, self.info()
 
@@ -183,10 +191,10 @@ class ForestEnv:
         self.drone.position, self.drone.angle, self.pose = (0.0, 0.0), 0.0, (0.0, 0.0, 0.0)
         self.actions, self.progress, self.total = [], 0.0, 0.0
         self.outcome, self.edge, self.terminated, self.truncated = "", "", False, False
-        self._measure()
+        self._sense()
 
-    def fly(self, action: int) -> float:
-        """All of a step but the looking: turn, fly, measure, judge. Returns the reward."""
+    def advance(self, action: int) -> float:
+        """All of a step but the looking: turn, fly, sense, judge. Returns the reward."""
         if self.outcome:
             raise ValueError(f"step needs a flight in the air, this one is {self.outcome}: reset")
         if not isinstance(action, int | np.integer) or not 0 <= action < self.world.actions:
@@ -197,14 +205,14 @@ class ForestEnv:
         self.drone.velocity = pymunk.Vec2d.from_polar(self.world.speed, heading)
         self.drone.angular_velocity = yaw_rate
         self.space.step(self.world.dt)
-        self._measure()
+        self._sense()
         self.outcome = self._judge()
         self.terminated, self.truncated = self.outcome not in ("", "time"), self.outcome == "time"
         r = reward(self.outcome, self.d_obs, self.d_goal, self.world)
         self.total += r
         return r
 
-    def _measure(self) -> None:
+    def _sense(self) -> None:
         before, self.pose = self.pose[0], (*self.drone.position, self.drone.angle)
         at, reach = self.pose[:2], self.world.laser_range
         self.forward, self.progress = at[0] - before, max(self.progress, at[0])
@@ -254,7 +262,7 @@ EVERYTHING = pymunk.ShapeFilter()
 
 
 def look(envs: Sequence[ForestEnv]) -> ndarray:
-    """What each drone sees, drawn in one call: frames (F, 84, 84) uint8."""
+    """What each of F drones sees, drawn in one call: pictures (F, 84, 84) uint8."""
     world = envs[0].world
     if not envs[0].has_camera:
         return np.zeros((len(envs), PIXELS, PIXELS), np.uint8)
@@ -275,7 +283,8 @@ def refly(seed: int, actions: Iterable, world: World, *, camera: bool = True) ->
 
 
 class Fleet:
-    """L drones that fly side by side, one forest each: a vector environment, in Gymnasium's words.
+    """L drones that fly side by side, each through its own forest. Gymnasium calls such an object,
+    which steps many environments with one call, a vector environment.
 
     One camera call draws what all of them see, which is quicker than a call for each. A drone that
     has landed waits, and takes no action, until its lane is reset. Each lane keeps a record of its
@@ -306,7 +315,7 @@ class Fleet:
         envs = [self.envs[lane] for lane in lanes]
         for lane, env, seed in zip(lanes, envs, seeds, strict=True):
             env.place(int(seed))
-            self.records[lane].append((env.seed, env.actions))
+            self.records[lane].append((env.seed, env.actions))  # the list grows as it flies
         for env, frame in zip(envs, look(envs) if envs else (), strict=True):
             env.observation = np.repeat(frame[None], STACK, 0)  # (4, 84, 84)
 
@@ -317,7 +326,7 @@ class Fleet:
         infos, as ForestEnv.step does for one.
         """
         envs = self.flying
-        r = [env.fly(a) for env, a in zip(envs, actions, strict=True)]
+        r = [env.advance(a) for env, a in zip(envs, actions, strict=True)]
         for env, frame in zip(envs, look(envs), strict=True):
             env.observation = np.concatenate([env.observation[1:], frame[None]])  # (4, 84, 84)
         s2 = np.stack([env.observation for env in envs])  # (F, 4, 84, 84)
@@ -325,7 +334,7 @@ class Fleet:
         return s2, np.array(r), terminated, truncated, [env.info() for env in envs]
 
     def record(self, steps: int) -> list[list[tuple[int, str]]]:
-        """Of every lane: seed and actions of each flight that has one of the last so many steps."""
+        """For every lane the flights that its last so many steps belong to: seeds and actions."""
         for flights in self.records:
             while sum(len(actions) for _, actions in flights[1:]) >= steps:
                 flights.pop(0)
@@ -384,8 +393,8 @@ def fly(pilot: Pilot, seeds: Sequence[int], world: World, *, camera: bool = True
 
 
 def fly_random(seeds: Sequence[int], world: World, rng: np.random.Generator) -> Flights:
-    """The bar: 2,000 random flights or more, equally many through each forest. A hundred would move
-    the bar itself, the mean flight, by a fifth."""
+    """The bar that others are compared with: 2,000 random flights or more, equally many through
+    each forest. The mean of only a hundred could be off by a fifth."""
     repeats = math.ceil(2000 / len(seeds))
     return fly(random_pilot(rng), list(seeds) * repeats, world, camera=False)
 
@@ -406,9 +415,10 @@ def show(text: str) -> None:
         print(f"\r{text}\x1b[K\r", end="", flush=True)
 
 
-# -------------------------------------------------- which worlds are legal: skip this
+# -------------------------------------------------- legal worlds: skip this on a first reading
 
-# Least and most of a world's numbers that may be other than 0.001 to 10,000. An action is a digit.
+# A world's numbers may go from 0.001 to 10,000; these have other limits. There are at most ten
+# actions, because a flight's record has one digit an action.
 LIMITS = dict.fromkeys(("first_x", "first_y", "r_safe", "r_precrash", "r_crash"), (-1e4, 1e4))
 LIMITS |= dict.fromkeys(("back", "jitter_x", "jitter_y", "beacon_pixels", "yaw_rate"), (0, 1e4))
 LIMITS |= dict.fromkeys(("sky", "ground", "trunk_facing", "trunk_grazing", "beacon_grey"), (0, 255))

@@ -1,4 +1,4 @@
-"""render.py: the eyes. A forest of upright cylinders becomes a grey picture of 84x84 pixels.
+r"""render.py: the eyes. A forest of upright cylinders becomes a grey picture of 84x84 pixels.
 
 There is no 3D engine here. Every trunk is upright, so each column of the picture is one ray in the
 ground plane. A camera is 84 rays. A laser scanner is 360 rays. One formula serves both.
@@ -17,11 +17,11 @@ ground plane. A camera is 84 rays. A laser scanner is 360 rays. One formula serv
     The formula: where does a ray meet a trunk?
 
                     . - .
-                  /       \\         along       from the eye to the point nearest the centre c
-      eye ------ # --- + - |--->    across      from that point to c, positive to the left
-                 |     |   |        half_chord  from the bark # to that point
-                  \\    c  /         radius      from the bark # to c: the hypotenuse
-                    ' - '
+                  /       \         along       from the eye to p, the ray's nearest point to the
+      eye ------ # --- p - |--->                trunk's centre c
+                 |     |   |        across      from p to c, positive to the left (here negative)
+                  \    c  /         half_chord  from the bark # to p
+                    ' - '           radius      from the bark # to c
 
       half_chord = sqrt(radius^2 - across^2)      by Pythagoras, if abs(across) < radius
       distance   = along - half_chord             from the eye to the bark
@@ -35,7 +35,7 @@ The two rules of a pinhole camera:
   * Column i looks along tan(bearing) = (41.5 - i) / 42, positive to the left. Columns are equally
     spaced on the picture plane, and not in angle.
   * A point h metres above the eye at depth z shows at row 41.5 - 42 * h / z. Depth is measured
-    along the optical axis. The distance along the ray would bend straight walls.
+    along the optical axis. With the distance along the ray instead, straight walls would look bent.
 
 Legend
     N  trunks
@@ -64,7 +64,7 @@ Point = tuple[float, float]  # x, y in m
 PIXELS = 84  # height and width of a picture [DF §II-A]
 CENTRE = (PIXELS - 1) / 2  # px: the optical axis meets the picture between its two middle pixels
 FOCAL = PIXELS / 2  # px: half the picture spans 45 degrees (the paper is silent: ours)
-SLOPES = (CENTRE - np.arange(PIXELS)) / FOCAL  # (84,) tangents: left to right, and top to bottom
+SLOPES = (CENTRE - np.arange(PIXELS)) / FOCAL  # (84,) tangents of the columns, and of the rows
 BEARINGS = np.arctan(SLOPES)  # (84,) rad
 COSINES = np.cos(BEARINGS)  # (84,) depth along the optical axis for each metre along a ray
 ROWS = np.arange(PIXELS, dtype=np.uint8)[:, None]  # (84, 1)
@@ -77,7 +77,7 @@ class Scene:
     trunk_radius: float = 0.5  # m, authors' simulator
     trunk_height: float = 6.0  # m, authors' simulator
     altitude: float = 2.0  # m, of the eye, authors' simulator
-    view: float = 40.0  # m, how far the camera sees: ours, as all below
+    view: float = 40.0  # m, how far the camera sees; this and all below are our choice
     beacon_height: float = 20.0  # m
     beacon_radius: float = 1.0  # m
     beacon_pixels: float = 3.0  # px, never drawn narrower than this
@@ -85,7 +85,7 @@ class Scene:
     ground: int = 60
     trunk_facing: int = 35  # bark seen head-on
     trunk_grazing: int = 0  # bark seen edge-on
-    beacon_grey: int = 140  # clear, but no more: pilots shun a white pole like bark
+    beacon_grey: int = 140  # brighter than all else; from a white pole pilots turned away
 
 
 def raycast(
@@ -97,7 +97,7 @@ def raycast(
 ) -> tuple[ndarray, ndarray]:
     """Find what each ray hits first.
 
-    trunks (N, 2): centres relative to the eye that looks, m. radius: one for all, or (N,), m.
+    trunks (N, 2): centres relative to the eye that looks, m. radius: one for all, or (N, 1), m.
     bearings (M,): rad, the same for every eye. eye: which eye looks at a trunk, one or (N,).
     Returns the rays of the first eye, then those of the next: distance (E * M,), m along the ray,
     inf where it hits nothing, and facing (E * M,), the cosine of the angle between the ray and the
@@ -107,17 +107,18 @@ def raycast(
     (array([4.5, inf]), array([1., 0.]))
     """
     cos, sin, rays = np.cos(bearings), np.sin(bearings), len(bearings)
-    along, across = trunks @ np.array([[cos, sin], [-sin, cos]])  # (N, M), (N, M) m
-    radius, eye = np.full(len(trunks), radius), np.full(len(trunks), eye)  # (N,), (N,)
-    meet = np.flatnonzero(np.abs(across) < radius[:, None])  # (H,) pairs of a trunk and a ray
+    along = trunks @ np.array([cos, sin])  # (N, M) m: x * cos + y * sin
+    across = trunks @ np.array([-sin, cos])  # (N, M) m: y * cos - x * sin
+    meet = np.flatnonzero(np.abs(across) < radius)  # (H,) pairs of a trunk and a ray
     trunk, ray = meet // rays, meet % rays  # (H,), (H,)
-    half_chord = np.sqrt(radius[trunk] ** 2 - across.ravel()[meet] ** 2)  # (H,) m
+    radius = np.full((len(trunks), 1), radius)[trunk, 0]  # (H,) m
+    half_chord = np.sqrt(radius**2 - across.ravel()[meet] ** 2)  # (H,) m
     distance = along.ravel()[meet] - half_chord  # (H,) m, negative: the trunk is behind the eye
     order = np.argsort(-distance)  # (H,) far to near: the nearest is written last, and stays
     order = order[distance[order] > 0]
-    which = (eye[trunk] * rays + ray)[order]
+    place = (np.full(len(trunks), eye)[trunk] * rays + ray)[order]  # in the flat result
     first, facing = np.full(eyes * rays, np.inf), np.zeros(eyes * rays)  # (E * M,), (E * M,)
-    first[which], facing[which] = distance[order], (half_chord / radius[trunk])[order]
+    first[place], facing[place] = distance[order], (half_chord / radius)[order]
     return first, facing
 
 
@@ -135,15 +136,11 @@ def backdrop(scene: Scene) -> ndarray:
 
 def silhouette(distance: ndarray, height: float, scene: Scene) -> ndarray:
     """Pixels (84, E * 84) bool that walls of this height cover, at distance (E * 84,) m."""
-    depth = distance * np.tile(COSINES, len(distance) // PIXELS)  # (E * 84,) m
-    top = CENTRE - FOCAL * (height - scene.altitude) / depth  # (E * 84,) rows
-    foot = CENTRE + FOCAL * scene.altitude / depth  # (E * 84,) rows
-    return (row_number(np.floor(top) + 1) <= ROWS) & (row_number(np.ceil(foot)) > ROWS)
-
-
-def row_number(row: ndarray) -> ndarray:
-    """Rows as small integers, 0 to 84, that compare quickly."""
-    return np.minimum(np.maximum(row, 0), PIXELS).astype(np.uint8)
+    depth = (distance.reshape(-1, PIXELS) * COSINES).ravel()  # (E * 84,) m
+    above = np.array([[height - scene.altitude], [-scene.altitude]])  # (2, 1) m, top and foot
+    rows = np.ceil(CENTRE - FOCAL * above / depth)  # (2, E * 84) the first, and the first beyond
+    top, end = np.minimum(np.maximum(rows, 0), PIXELS).astype(np.uint8)  # (E * 84,) each
+    return (top <= ROWS) & (end > ROWS)
 
 
 def camera(
@@ -169,10 +166,11 @@ def camera(
     bark = scene.trunk_grazing + (scene.trunk_facing - scene.trunk_grazing) * facing  # (E * 84,)
     trunk = silhouette(distance, scene.trunk_height, scene)  # (84, E * 84)
     grey = fade(bark, distance, scene).astype(np.uint8)  # (E * 84,)
-    frames = np.where(trunk, grey, backdrop(scene))  # (84, E * 84)
+    # Bark where there is a trunk. Below zero uint8 starts again at 255; the sum brings it back.
+    frames = backdrop(scene) + trunk * (grey - backdrop(scene))  # (84, E * 84)
     if beacon is not None:
-        goal = (np.subtract(beacon, at)[:, None] @ turn)[:, 0]  # (E, 2) m
-        radius = np.maximum(scene.beacon_radius, scene.beacon_pixels / 2 / FOCAL * goal[:, 0])
+        goal = (np.subtract(beacon, at)[:, None] @ turn)[:, 0]  # (E, 2) m, ahead and left
+        radius = np.maximum(scene.beacon_radius, scene.beacon_pixels / 2 / FOCAL * goal[:, :1])
         pole_distance, _ = raycast(goal, radius, BEARINGS, np.arange(eyes), eyes)  # (E * 84,) m
         pole = silhouette(pole_distance, scene.beacon_height, scene)  # (84, E * 84)
         frames[pole & ~(trunk & (distance < pole_distance))] = scene.beacon_grey

@@ -126,7 +126,7 @@ def test_stacks_and_windows_are_those_of_the_whole_history(n: int, rows: int) ->
             assert number(got.s)[0].tolist() == s
             assert got.a[0] == a
             assert got.r[0] == pytest.approx(r, abs=1e-5)
-            assert got.discount[0] == pytest.approx(gamma)
+            assert got.gamma_n[0] == pytest.approx(gamma)
             assert got.end[0] == end
             assert s2 is None or number(got.s2)[0].tolist() == s2
 
@@ -173,7 +173,7 @@ def target(r: float, discount: float, end: int, choose: list[float], value: list
 def label(replay: Replay, row: int, n: int, gamma: float, best: float) -> float:
     """The label of the transition at this row, where the best value of every state is `best`."""
     batch, q2 = window(replay, row, n, gamma), torch.tensor([[best - 1, best, best - 2]])
-    r, discount, end = map(torch.from_numpy, (batch.r, batch.discount, batch.end))
+    r, discount, end = map(torch.from_numpy, (batch.r, batch.gamma_n, batch.end))
     return td_target(r, discount, end, q2, q2).item()
 
 
@@ -198,7 +198,7 @@ def test_the_label_of_three_rewards_by_hand() -> None:
         replay = one_flight([4.0, 2.0, -6.0], end)
         three = 4 + 0.5 * 2 + 0.25 * -6  # 3.5
         assert window(replay, 3, 3, 0.5).r[0] == three
-        assert window(replay, 3, 3, 0.5).discount[0] == 0.125
+        assert window(replay, 3, 3, 0.5).gamma_n[0] == 0.125
         assert label(replay, 3, 3, 0.5, best=8.0) == three + 0.125 * after
         assert label(replay, 4, 2, 0.5, best=8.0) == 2 + 0.5 * -6 + 0.25 * after
         assert label(replay, 5, 1, 0.5, best=8.0) == -6 + 0.5 * after
@@ -241,7 +241,7 @@ def test_mirroring_reflects_whole_transitions_and_half_of_them() -> None:
         batch.a == np.where(flipped, 8 - a, a)
     ).all()  # the sharpest left for the sharpest right
     assert (batch.r == r).all()
-    assert (batch.discount == discount).all()
+    assert (batch.gamma_n == discount).all()
     assert (batch.end == end).all()
 
 

@@ -216,7 +216,7 @@ def test_eyes_that_see_no_trunk_at_all_see_sky_and_ground() -> None:
 def test_rays_of_many_eyes_stop_where_those_of_each_alone_do() -> None:
     rng = np.random.default_rng(4)
     forests, bearings = [random_trunks(rng, n) for n in (20, 0, 7)], rng.uniform(-3, 3, 50)
-    radii = [rng.uniform(0.2, 1.2, len(forest)) for forest in forests]
+    radii = [rng.uniform(0.2, 1.2, (len(forest), 1)) for forest in forests]
     alone = [raycast(forest, r, bearings) for forest, r in zip(forests, radii, strict=True)]
     eye = np.repeat(np.arange(3), [20, 0, 7])
     order = rng.permutation(27)  # trunks come in any order
