@@ -175,8 +175,9 @@ class QNetwork(nn.Module):
         float32: values near 100 are common here, bfloat16 has only steps of 0.5 there, and actions
         would tie.
         """
+        grey = s.to(torch.bfloat16 if bfloat16 else torch.float32).div_(255)  # (B, 4, 84, 84) 0..1
         with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
-            seen = self.conv(s.float() / 255)  # (B, 3136)
+            seen = self.conv(grey)  # (B, 3136)
         return self.head(seen.float())  # (B, A)
 
 
