@@ -7,8 +7,18 @@
     python deepflight.py eval                   fly weights/paper.pt against three other pilots
     python deepflight.py eval --beacon          fly weights/beacon.pt where the goal is visible
 
-The story stands first: the settings, what the learner is paid, `train`, `evaluate`. The plumbing
-stands last: files, signals, clocks, the command line.
+The story stands first: the settings, what the learner is paid, `train`, `evaluate`. Statistics and
+plumbing (files, signals, clocks, the command line) stand last; a first reading may skip them.
+
+`train` prints a row at every test point:
+
+     step   eps steps/s min left return | test: return over random crossed crash
+   10,000  0.76     198     24.4  -19.7          -43.0        204%      0%   15%
+
+It has flown 10,000 control steps, and 76 % of its actions are random at this point. The last 100
+training flights earned -19.7 on average. Then the network flew 48 test forests without random
+actions: it earned -43.0 a flight, stayed in the air 204 % longer than the random pilot, crossed the
+forest in none of the flights, and crashed in 15 %.
 
 A seed is a forest. Training plants forests from [0, 10^9). Test points choose the weights to keep,
 and fly forests from [10^9, 2 * 10^9). `eval` starts at 2 * 10^9, so its forests neither shaped the
@@ -179,16 +189,7 @@ def dqn_pilot(q: QNetwork) -> Pilot:
 
 def evaluate(args: argparse.Namespace) -> int:
     """Fly every pilot through the same forests; print the table, write pictures and JSON."""
-    if args.episodes < 1 or args.first_seed < 0:
-        raise ValueError(f"episodes {args.episodes} < 1 or first-seed {args.first_seed} < 0")
-    if args.json and (args.json.is_dir() or not args.json.absolute().parent.is_dir()):
-        raise ValueError(f"{args.json} cannot be written: it needs an existing folder")
-    shipped = Path(__file__).parent / "weights" / ("beacon.pt" if args.beacon else "paper.pt")
-    q = dqn.load_weights(args.weights or shipped, World.actions, beacon=args.beacon)
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"out is {args.out}, allowed is a folder: {error}") from None
+    q = check_eval(args)
     torch.set_num_threads(RunConfig.threads)
     world, rng = World(beacon=args.beacon), np.random.default_rng(0)
     seeds = range(args.first_seed, args.first_seed + args.episodes)
@@ -199,7 +200,7 @@ def evaluate(args: argparse.Namespace) -> int:
     print(f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in brackets\n")
     print_table(figures)
     if args.json:
-        report = {"weights": str(args.weights or shipped), "beacon": args.beacon}
+        report = {"weights": str(args.weights), "beacon": args.beacon}
         report |= {"first_seed": seeds[0], "forests": len(seeds)}
         report["pilots"] = {p: figures[p] | {"flights": flights[p]} for p in flights}
         dqn.write_whole(args.json, json.dumps(report).encode())
@@ -208,6 +209,37 @@ def evaluate(args: argparse.Namespace) -> int:
     render.save_film(args.out / "flight.gif", pictures, round(1000 * world.dt))
     print(f"\nwrote {args.out / 'flight.gif'}: forest {seeds[best]}, pilot {args.pilots[-1]}")
     return 0
+
+
+@torch.no_grad()
+def film(flown: dict[str, dict], world: World, q: QNetwork) -> Iterator[render.Image.Image]:
+    """The pictures of the last pilot's flight: what it sees, its Q, a map with all pilots' ways."""
+    *others, (name, flight) = flown.items()
+    trunks, title = env.plant(flight["seed"], world), f"forest {flight['seed']}"
+    chart = render.draw_map(trunks, (world.length, world.width), title)
+    chart = render.draw_ways(chart, [(*track(f, world), pilot) for pilot, f in others])
+    (path, end), total = track(flight, world), 0.0
+    for t, (s, r, *_, info) in enumerate(refly(flight["seed"], flight["actions"], world)):
+        total += r
+        action, ended = (int(flight["actions"][t]), "") if t < flight["steps"] else (-1, end)
+        if t % (1 + flight["steps"] // 300) and not ended:
+            continue  # of a long flight not every step is filmed
+        seen = render.draw_ways(chart, [(path[: t + 1], ended, name)])
+        values = q(torch.from_numpy(s)[None])[0].numpy() if name == "dqn" else None  # (A,)
+        clock = f"{t * world.dt:.1f} s, {info['d_goal']:.1f} m to the goal"
+        lines = (f"{name}: {clock}", f"reward so far {total:.1f}", render.ENDS[ended])
+        panel = render.draw_panel(s[-1], seen, values, action, lines)
+        yield panel
+    yield from [panel] * 20  # the end stays for two seconds
+
+
+def track(flight: dict[str, Any], world: World) -> tuple[ndarray, str]:
+    """Where a flight went (T, 2) in m, by flying it again, and its edge or outcome."""
+    steps = refly(flight["seed"], flight["actions"], world, camera=False)
+    return np.array([info["pose"][:2] for *_, info in steps]), flight["edge"] or flight["outcome"]
+
+
+# -------------------------------------------------- statistics: skip them on a first reading
 
 
 def summarize(flights: Flights, bar: Flights, forests: int, rng: Generator) -> dict[str, dict]:
@@ -258,34 +290,6 @@ def print_table(figures: dict[str, dict]) -> None:
     for key, (label, factor, digits) in ROWS.items():
         cells = [[f"{factor * x:.{digits}f}" for x in p[key].values()] for p in figures.values()]
         print(f"{label:12}" + "".join(f"{f'{x} [{low}, {high}]':>17}" for x, low, high in cells))
-
-
-@torch.no_grad()
-def film(flown: dict[str, dict], world: World, q: QNetwork) -> Iterator[render.Image.Image]:
-    """The pictures of the last pilot's flight: what it sees, Q, the map with all pilots' ways."""
-    *others, (name, flight) = flown.items()
-    trunks, title = env.plant(flight["seed"], world), f"forest {flight['seed']}"
-    chart = render.draw_map(trunks, (world.length, world.width), title)
-    chart = render.draw_ways(chart, [(*track(f, world), pilot) for pilot, f in others])
-    (path, end), total = track(flight, world), 0.0
-    for t, (s, r, *_, info) in enumerate(refly(flight["seed"], flight["actions"], world)):
-        total += r
-        action, ended = (int(flight["actions"][t]), "") if t < flight["steps"] else (-1, end)
-        if t % (1 + flight["steps"] // 300) and not ended:
-            continue  # of a long flight not every step is filmed
-        seen = render.draw_ways(chart, [(path[: t + 1], ended, name)])
-        values = q(torch.from_numpy(s)[None])[0].numpy() if name == "dqn" else None  # (A,)
-        clock = f"{t * world.dt:.1f} s, {info['d_goal']:.1f} m to the goal"
-        lines = (f"{name}: {clock}", f"return {total:.1f}", render.ENDS[ended])
-        panel = render.draw_panel(s[-1], seen, values, action, lines)
-        yield panel
-    yield from [panel] * 20  # the end stays for two seconds
-
-
-def track(flight: dict[str, Any], world: World) -> tuple[ndarray, str]:
-    """Where a flight went (T, 2) in m, by flying it again, and its edge or outcome."""
-    steps = refly(flight["seed"], flight["actions"], world, camera=False)
-    return np.array([info["pose"][:2] for *_, info in steps]), flight["edge"] or flight["outcome"]
 
 
 # -------------------------------------------------- plumbing: skip it on a first reading
@@ -483,6 +487,22 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
     if min(c.replay_size, c.learning_starts) < (least := c.num_envs * (c.n_steps + 4)):
         raise ValueError(f"replay_size, learning_starts: one is below the least, {least}")
     return c, rc
+
+
+def check_eval(args: argparse.Namespace) -> QNetwork:
+    """Check all that is given, before anything flies, and read the weights."""
+    if args.episodes < 1 or args.first_seed < 0:
+        raise ValueError(f"episodes {args.episodes} < 1 or first-seed {args.first_seed} < 0")
+    if args.json and (args.json.is_dir() or not args.json.absolute().parent.is_dir()):
+        raise ValueError(f"{args.json} cannot be written: it needs an existing folder")
+    shipped = Path(__file__).parent / "weights" / ("beacon.pt" if args.beacon else "paper.pt")
+    args.weights = args.weights or shipped
+    q = dqn.load_weights(args.weights, World.actions, beacon=args.beacon)
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"out is {args.out}, allowed is a folder: {error}") from None
+    return q
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -233,7 +233,8 @@ class ForestEnv:
 
     def info(self) -> dict[str, Any]:
         """Where the drone is, and at the end what became of it."""
-        info = {key: getattr(self, key) for key in ("d_obs", "d_goal", "forward", "pose")}
+        info: dict[str, Any] = {"d_obs": self.d_obs, "d_goal": self.d_goal, "pose": self.pose}
+        info["forward"] = self.forward
         if self.outcome:
             info |= {"outcome": self.outcome, "edge": self.edge, "progress": self.progress}
         return info

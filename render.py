@@ -89,16 +89,12 @@ class Scene:
 
 
 def raycast(
-    trunks: ndarray,
-    radius: ndarray | float,
-    bearings: ndarray,
-    eye: ndarray | int = 0,
-    eyes: int = 1,
+    trunks: ndarray, radius: float, bearings: ndarray, eye: ndarray | None = None, eyes: int = 1
 ) -> tuple[ndarray, ndarray]:
     """Find what each ray hits first.
 
-    trunks (N, 2): centres relative to the eye that looks, m. radius: one for all, or (N, 1), m.
-    bearings (M,): rad, the same for every eye. eye: which eye looks at a trunk, one or (N,).
+    trunks (N, 2): centres relative to the eye that looks, m. radius: m. bearings (M,): rad, the
+    same for every eye. eye (N,): which of several eyes looks at which trunk.
     Returns the rays of the first eye, then those of the next: distance (E * M,), m along the ray,
     inf where it hits nothing, and facing (E * M,), the cosine of the angle between the ray and the
     surface's normal: 1 head-on, 0 grazing.
@@ -110,15 +106,14 @@ def raycast(
     along = trunks @ np.array([cos, sin])  # (N, M) m: x * cos + y * sin
     across = trunks @ np.array([-sin, cos])  # (N, M) m: y * cos - x * sin
     meet = np.flatnonzero(np.abs(across) < radius)  # (H,) pairs of a trunk and a ray
-    trunk, ray = meet // rays, meet % rays  # (H,), (H,)
-    radius = np.full((len(trunks), 1), radius)[trunk, 0]  # (H,) m
     half_chord = np.sqrt(radius**2 - across.ravel()[meet] ** 2)  # (H,) m
     distance = along.ravel()[meet] - half_chord  # (H,) m, negative: the trunk is behind the eye
     order = np.argsort(-distance)  # (H,) far to near: the nearest is written last, and stays
     order = order[distance[order] > 0]
-    place = (np.full(len(trunks), eye)[trunk] * rays + ray)[order]  # in the flat result
+    trunk, ray = meet[order] // rays, meet[order] % rays  # (H,), (H,)
+    place = ray if eye is None else eye[trunk] * rays + ray  # (H,) in the result
     first, facing = np.full(eyes * rays, np.inf), np.zeros(eyes * rays)  # (E * M,), (E * M,)
-    first[place], facing[place] = distance[order], (half_chord / radius)[order]
+    first[place], facing[place] = distance[order], half_chord[order] / radius
     return first, facing
 
 
@@ -166,14 +161,19 @@ def camera(
     bark = scene.trunk_grazing + (scene.trunk_facing - scene.trunk_grazing) * facing  # (E * 84,)
     trunk = silhouette(distance, scene.trunk_height, scene)  # (84, E * 84)
     grey = fade(bark, distance, scene).astype(np.uint8)  # (E * 84,)
-    # Bark where there is a trunk. Below zero uint8 starts again at 255; the sum brings it back.
-    frames = backdrop(scene) + trunk * (grey - backdrop(scene))  # (84, E * 84)
+    behind = backdrop(scene)  # (84, 1)
+    # Bark where there is a trunk. Below zero uint8 starts again at 255, and the sum undoes it.
+    frames = behind + trunk * (grey - behind)  # (84, E * 84)
     if beacon is not None:
         goal = (np.subtract(beacon, at)[:, None] @ turn)[:, 0]  # (E, 2) m, ahead and left
-        radius = np.maximum(scene.beacon_radius, scene.beacon_pixels / 2 / FOCAL * goal[:, :1])
-        pole_distance, _ = raycast(goal, radius, BEARINGS, np.arange(eyes), eyes)  # (E * 84,) m
-        pole = silhouette(pole_distance, scene.beacon_height, scene)  # (84, E * 84)
-        frames[pole & ~(trunk & (distance < pole_distance))] = scene.beacon_grey
+        least = scene.beacon_pixels / 2 / FOCAL * goal[:, 0]  # (E,) m, the least radius to draw
+        scale = np.maximum(scene.beacon_radius, least) / scene.trunk_radius  # (E,)
+        # A pole twice as wide and twice as far away looks the same.
+        near_goal = goal / scale[:, None]  # (E, 2) m
+        to_pole, _ = raycast(near_goal, scene.trunk_radius, BEARINGS, np.arange(eyes), eyes)
+        to_pole *= np.repeat(scale, PIXELS)  # (E * 84,) m
+        pole = silhouette(to_pole, scene.beacon_height, scene)  # (84, E * 84)
+        frames[pole & ~(trunk & (distance < to_pole))] = scene.beacon_grey
     return np.ascontiguousarray(frames.reshape(PIXELS, eyes, PIXELS).swapaxes(0, 1))
 
 

@@ -216,12 +216,11 @@ def test_eyes_that_see_no_trunk_at_all_see_sky_and_ground() -> None:
 def test_rays_of_many_eyes_stop_where_those_of_each_alone_do() -> None:
     rng = np.random.default_rng(4)
     forests, bearings = [random_trunks(rng, n) for n in (20, 0, 7)], rng.uniform(-3, 3, 50)
-    radii = [rng.uniform(0.2, 1.2, (len(forest), 1)) for forest in forests]
-    alone = [raycast(forest, r, bearings) for forest, r in zip(forests, radii, strict=True)]
+    alone = [raycast(forest, 0.5, bearings) for forest in forests]
     eye = np.repeat(np.arange(3), [20, 0, 7])
     order = rng.permutation(27)  # trunks come in any order
-    trunks, radius = np.concatenate(forests)[order], np.concatenate(radii)[order]
-    distance, facing = raycast(trunks, radius, bearings, eye[order], 3)
+    trunks = np.concatenate(forests)[order]
+    distance, facing = raycast(trunks, 0.5, bearings, eye[order], 3)
     assert (distance == np.concatenate([d for d, _ in alone])).all()
     assert (facing == np.concatenate([f for _, f in alone])).all()
 
