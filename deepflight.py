@@ -15,10 +15,10 @@ plumbing (files, signals, clocks, the command line) stand last; a first reading 
      step   eps steps/s min left return | test: return over random crossed crash
    10,000  0.76     198     24.4  -19.7          -43.0        204%      0%   15%
 
-It has flown 10,000 control steps, and 76 % of its actions are random at this point. The last 100
-training flights earned -19.7 on average. Then the network flew 48 test forests without random
-actions: it earned -43.0 a flight, stayed in the air 204 % longer than the random pilot, crossed the
-forest in none of the flights, and crashed in 15 %.
+The drones have flown 10,000 control steps, and 76 % of the actions are random at this point. The
+last 100 training flights earned -19.7 each on average. Then the network flew through 48 test
+forests without random actions. It earned -43.0 per flight, stayed in the air 204 % longer than the
+random pilot, crossed the forest in none of the flights, and crashed in 15 %.
 
 A seed is a forest. Training plants forests from [0, 10^9). Test points choose the weights to keep,
 and fly forests from [10^9, 2 * 10^9). `eval` starts at 2 * 10^9, so its forests neither shaped the
@@ -67,11 +67,11 @@ class RunConfig:
 
     seed: int = dqn.setting(0, "of everything random", 0)
     beacon: bool = dqn.setting(False, "put a visible pole at the goal", 0, 1)
-    threads: int = dqn.setting(2, "of torch; another number gives other last digits", 1, 256)
+    threads: int = dqn.setting(2, "of the CPU; other numbers give other last digits", 1, 256)
     test_every: int = dqn.setting(5_000, "control steps between test points, which also save", 1)
     forward_reward: float = dqn.setting(6.0, "[+] for a metre nearer the far edge; 0: off", 0, 1e3)
-    goal_value: float = dqn.setting(125.0, "[+] of the state after arrival; 0: off", -1e6, 1e6)
-    far_value: float = dqn.setting(200.0, "[+] of that beyond the far edge; 0: off", -1e6, 1e6)
+    goal_value: float = dqn.setting(125.0, "[+] worth of arrival at the goal; 0: off", -1e6, 1e6)
+    far_value: float = dqn.setting(200.0, "[+] worth of leaving by the far edge; 0: off", -1e6, 1e6)
 
 
 SETTINGS = (*fields(DQNConfig), *fields(RunConfig))
@@ -104,14 +104,16 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
     that flies on.
     Why goal_value: arrival ends the flight, and with it all rewards. A drone that circled at the
     goal for ever would earn 1.25 + 0.99 * 1.25 + 0.99^2 * 1.25 + ... = 1.25 / (1 - 0.99) = 125.
-    If arrival paid less, circling would be better.
+    If arrival paid less, circling would be better. The value stands for the return after the end,
+    one step later, so it is discounted once: gamma * 125.
     Why far_value: no picture shows which edge is the far one. Leaving by any other edge costs 10,
     and so does this one in the paper's reward. It must pay so much that the risk is worth it; 200
     was found by trial. It is more than 125, so this pilot crosses often and seldom arrives.
 
-    The field calls this reward shaping. There is a kind of shaping that provably leaves the best
-    policy as it is [Ng 1999]; this is another kind, and it is meant to change the policy. Only the
-    learner sees it. Every reward that is printed or logged is the paper's.
+    The field calls this reward shaping. A policy is a rule that picks the action in every state.
+    Some shaping provably leaves the best policy as it is: it is the difference of a potential
+    between two states [Ng 1999]. Ours is not of that kind, and is meant to change the policy. Only
+    the learner sees it. Every reward that is printed or logged is the paper's.
     """
     forward = np.array([info["forward"] for info in infos])  # (L,) m
     arrived = np.array([info.get("outcome") == "goal" for info in infos])  # (L,)
@@ -121,6 +123,22 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 
 
 # -------------------------------------------------- train
+
+# Textbook DQN, for one drone, without files and tests:
+#
+#     for each step:
+#         a = a random action with probability epsilon, else the a of greatest Q(s, a)
+#         s2, r, end = fly(a)
+#         put s, a, r, s2, end into the replay
+#         every 4 steps:
+#             s, a, r, s2, end = 32 random transitions of the replay
+#             y = r if end is TERMINAL else r + gamma * max Q^(s2, .)
+#             loss = the mean of (y - Q(s, a))^2
+#             move the weights of Q a little against the gradient of the loss
+#             every so many updates: Q^ = Q
+#
+# `train` is this loop, and the pieces marked [+name]. `run` (class Run, below) counts the steps, 8
+# at a time because 8 drones fly, says how many updates or tests are due, tests, saves and stops.
 
 
 def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | None = None) -> int:
@@ -136,8 +154,8 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
         # [+lr_decay] The learning rate: large strides at first, small ones to settle.
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)
         agent.optimizer.param_groups[0]["lr"] = lr
-        # [+huber] The loss of an error e is e^2 / (2 delta) up to delta, |e| - delta / 2 beyond. A
-        # small delta learns the median of what may come, and rare crashes do not move a median.
+        # [+huber] The loss of an error e is e^2 / (2 delta) up to delta, |e| - delta / 2 beyond.
+        # All errors beyond pull alike, which is steady at first; later a crash must weigh more.
         delta = c.huber if step > c.huber_after else 1.0
 
         fleet.reset(fleet.landed, rng.integers(TRAIN_END, size=len(fleet.landed)))  # 4, 5
@@ -153,10 +171,10 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
         for _ in range(run.due(c.update_every) if step >= c.learning_starts else 0):
             batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
             batch = mirror(batch, world.actions, rng) if c.mirror else batch  # [+mirror]
-            s, a, r, s2, gamma_n, end = map(torch.from_numpy, batch)  # (B, ...), as in Batch
+            s, a, r, s2, gamma_n, end = map(torch.from_numpy, batch)  # (B, ...) of the batch
             with torch.no_grad():
-                q2 = agent.q_target(s2, agent.bfloat16)  # (B, A)
-                # [+double] A maximum of noisy values is too high: Q chooses a2, Q^ values it.
+                q2 = agent.q_target(s2, agent.bfloat16)  # (B, A) [+bfloat16]
+                # [+double] Q chooses a2, and Q^ says what it is worth.
                 q2_online = agent.q(s2, agent.bfloat16) if c.double else q2  # (B, A)
                 y = td_target(r, gamma_n, end, q2, q2_online)  # (B,) 13
             q = agent.q(s, agent.bfloat16).gather(1, a[:, None])[:, 0]  # (B,)
@@ -247,7 +265,7 @@ def summarize(flights: Flights, bar: Flights, forests: int, rng: Generator) -> d
 
     Flights through the same forest resemble each other. So a mean is taken over forests, and its
     interval comes from the bootstrap: draw as many forests again, with replacement, 2,000 times,
-    and see how the mean varies. A share has Wilson's interval, right for one flight a forest.
+    and see how the mean varies. A share has Wilson's interval, right for one flight per forest.
     """
     table, random_steps = measure(flights), measure(bar)["steps"].reshape(-1, forests).mean(0)
     draws = rng.integers(forests, size=(2000, forests))  # (2000, forests) resampled
@@ -342,7 +360,7 @@ class Run:
         return self.c.average > 0 and self.book["step"] > (1 - self.c.average) * self.c.steps
 
     def due(self, every: int) -> int:
-        """How many updates or tests fall on this step, if one falls on every so many steps."""
+        """How many updates or tests fall due on this step: one for each so many control steps."""
         return self.book["step"] // every - (self.book["step"] - self.c.num_envs) // every
 
     def note(self) -> None:
@@ -380,7 +398,7 @@ class Run:
         print(ROW.format(**row | self.clock), flush=True)
 
     def save(self) -> None:
-        """Write the checkpoint: 34 MB, and of the replay one byte a step and each flight's seed."""
+        """Write the checkpoint: 34 MB; of the replay only each flight's seed and actions."""
         content = {"settings": asdict(self.c) | asdict(self.rc), "machine": dqn.MACHINE}
         content |= {"agent": self.agent.state_dict(), "rng": self.rng.bit_generator.state}
         content |= {"added": self.replay.added, "flights": self.fleet.record(self.replay.rows)}
@@ -473,7 +491,7 @@ def start_training(args: argparse.Namespace) -> int:
     numbers = (Path(f"runs/{i:03d}") for i in range(1, 10**6))
     folder = Path("runs") / args.name if args.name else next(p for p in numbers if not p.exists())
     if folder.parent != Path("runs") or folder.name == ".." or folder.exists():
-        raise ValueError(f"name is {args.name!r}, allowed is that of a new folder in runs/")
+        raise ValueError(f"name is {args.name!r}, allowed is one that runs/ does not have yet")
     return train(*configure(preset | given), folder)
 
 
@@ -484,17 +502,20 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
     for settings in (c, rc):
         env.check_numbers(settings, {f.name: f.metadata["legal"] for f in fields(settings)})
     # The least: three rows to complete a stack, n_steps that wait for rewards, one to draw.
-    if min(c.replay_size, c.learning_starts) < (least := c.num_envs * (c.n_steps + 4)):
-        raise ValueError(f"replay_size, learning_starts: one is below the least, {least}")
+    for name in ("replay_size", "learning_starts"):
+        if (value := getattr(c, name)) < (least := c.num_envs * (c.n_steps + 4)):
+            raise ValueError(f"{name} is {value}, below num_envs * (n_steps + 4) = {least}")
     return c, rc
 
 
 def check_eval(args: argparse.Namespace) -> QNetwork:
     """Check all that is given, before anything flies, and read the weights."""
-    if args.episodes < 1 or args.first_seed < 0:
-        raise ValueError(f"episodes {args.episodes} < 1 or first-seed {args.first_seed} < 0")
-    if args.json and (args.json.is_dir() or not args.json.absolute().parent.is_dir()):
-        raise ValueError(f"{args.json} cannot be written: it needs an existing folder")
+    for name, least in (("episodes", 1), ("first_seed", 0)):
+        if (value := vars(args)[name]) < least:
+            raise ValueError(f"{name} is {value}, allowed are whole numbers from {least}")
+    path = args.json or Path("new.json")
+    if (path.exists() and not path.is_file()) or not path.absolute().parent.is_dir():
+        raise ValueError(f"json is {path}, allowed is a file in a folder that exists")
     shipped = Path(__file__).parent / "weights" / ("beacon.pt" if args.beacon else "paper.pt")
     args.weights = args.weights or shipped
     q = dqn.load_weights(args.weights, World.actions, beacon=args.beacon)

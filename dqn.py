@@ -16,22 +16,25 @@ trunks behind the next one. A drone that knows Q can fly: it takes the action wh
 A neural network learns Q. It is a function with 1.7 million adjustable numbers, its weights. Four
 pictures go in. Nine numbers come out, one for each action. It learns from examples, each an input
 with a label: the number that should have come out. Nobody has the labels. But the return from s is
-r plus gamma times the return from s2, so every transition makes a label y for Q(s, a):
+r plus gamma times the return from s2, and the drone that takes the best action in s2 may expect the
+greatest Q of s2. So every transition makes a label y for Q(s, a):
 
     y = r + gamma * max over a2 of Q(s2, a2)        at the end of a flight: y = r
 
 In numbers: r = 0.5, and the greatest of the nine values Q(s2, .) is 10. Then y = 0.5 + 0.99 * 10 =
-10.4. If Q(s, a) is 8, it is wrong by 2.4. A gradient step changes every weight a little, in the
-direction that makes this error smaller. Now Q(s, a) is perhaps 8.1. The label is called the TD
+10.4. If Q(s, a) is 8, its error is 2.4. A gradient step changes every weight a little, in the
+direction that makes the error smaller. Now Q(s, a) is perhaps 8.1. The label is called the TD
 target (for temporal difference), and the equation is Bellman's.
 
 How can a network learn from labels that it makes itself? Each label holds one true reward, and at
-the end of a flight the whole label is true. Take three steps with rewards 0.5, 0.5, -10, and a Q
-that is 0 everywhere. If every update went all the way to its label, Q of the three would be
+the end of a flight the whole label is true. Take a flight of three steps with rewards 0.5, 0.5 and
+-10. To keep it small, let there be one action only, so that the max is its Q. Let all Q be 0 at
+first, and let every update go all the way to its label:
 
-    after update 1       0.5       0.5     -10      the crash is known
-    after update 2       1.0      -9.4     -10      0.5 + 0.99 * -10 = -9.4
-    after update 3      -8.8      -9.4     -10      0.5 + 0.99 * -9.4 = -8.8: all three are true
+                  Q of step 1   step 2   step 3
+    after update 1    0.5         0.5     -10     the crash is known
+    after update 2    1.0        -9.4     -10     0.5 + 0.99 * -10 = -9.4
+    after update 3   -8.8        -9.4     -10     0.5 + 0.99 * -9.4 = -8.8: all three are true
 
 The truth moves backwards through the flight. Three things can go wrong. DQN has an answer to each:
 
@@ -68,11 +71,13 @@ code carries these numbers. `train` in deepflight.py has all of them on one scre
 In our words: an episode is a flight, the emulator is env.py, x is a picture, phi_t is the stack of
 four pictures that we call s, and theta are the weights.
 
-PyTorch in five lines
+PyTorch in six lines. The loss is one number that says how wrong a batch of outputs is, such as the
+mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, and how fast.
     q(s)               calls QNetwork.forward; a tensor is an array that remembers how it was made
-    torch.no_grad()    do not remember: nothing here is to be learnt from
-    loss.backward()    for every weight, find which way the loss grows
-    optimizer.step()   move every weight a little the other way
+    torch.no_grad()    do not remember: nothing is to be learnt from what is computed here
+    optimizer.zero_grad()   forget the last gradient
+    loss.backward()    compute the gradient
+    optimizer.step()   move every weight a little against it; the learning rate says how far
     q.gather(1, a)     in NumPy: q[arange(len(q)), a]
 
 A mark like [+double] means: not in the textbook. The name is the setting that switches it off.
@@ -124,14 +129,14 @@ class DQNConfig:
     """The algorithm's settings. [+] is not in the textbook; its text says what switches it off."""
 
     steps: int = setting(300_000, "control steps in all", 1)
-    gamma: float = setting(0.99, "discount of a step [DF II-A]", 0, 1)
+    gamma: float = setting(0.99, "discount per step [DF II-A]", 0, 1)
     replay_size: int = setting(200_000, "transitions remembered, 7.1 kB each", 1)
     learning_starts: int = setting(5_000, "control steps before the first update", 1)
-    update_every: int = setting(4, "control steps an update [Mnih15]", 1)
-    batch_size: int = setting(32, "transitions an update [Mnih15]", 1, 10_000)
+    update_every: int = setting(4, "control steps per update [Mnih15]", 1)
+    batch_size: int = setting(32, "transitions per update [Mnih15]", 1, 10_000)
     target_every: int = setting(500, "updates between copies of Q to the target network", 1)
-    epsilon_final: float = setting(0.05, "share of random actions in the end, at first 1", 0, 1)
-    epsilon_decay: int = setting(40_000, "control steps until then", 1)
+    epsilon_final: float = setting(0.05, "share of random actions in the end; it starts at 1", 0, 1)
+    epsilon_decay: int = setting(40_000, "control steps until epsilon is at its final value", 1)
     lr: float = setting(2.5e-4, "learning rate [Mnih15]", 0, 1)
     adam: bool = setting(True, "[+] Adam; --no-adam: RMSprop", 0, 1)
     num_envs: int = setting(8, "[+] drones that fly side by side; 1: off", 1, 1000)
@@ -150,12 +155,13 @@ class DQNConfig:
 
 
 class QNetwork(nn.Module):
-    """The network of [Mnih15, Methods]. Its last layer is linear, because values may be negative.
+    """The network of [Mnih15, Methods].
 
     pictures (4, 84, 84) -> conv 32 8x8/4 -> conv 64 4x4/2 -> conv 64 3x3/1 -> 512 -> Q(s, .) (A,)
 
     conv 32 8x8/4: 32 small filters of 8x8 pixels slide over the picture in strides of 4 pixels, and
-    each answers strongly where it finds its pattern.
+    each answers strongly where it finds its pattern. ReLU makes negative numbers 0. The last layer
+    has none, because values may be negative.
     """
 
     def __init__(self, actions: int) -> None:
@@ -190,9 +196,12 @@ def greedy(q: QNetwork, s: ndarray) -> ndarray:
 def td_target(r: Tensor, gamma_n: Tensor, end: Tensor, q2: Tensor, q2_online: Tensor) -> Tensor:
     """The label y (B,) of line 13: r + gamma * max_a2 Q^(s2, a2), or r where the world ended.
 
-    r, gamma_n, end (B,). q2 (B, A): Q^(s2, .), which says what an action is worth. q2_online
-    (B, A): the values by which the best action is chosen; in the textbook these are q2 too. Only
-    TERMINAL stops the sum: a time limit ends the flight, but not the world.
+    r, gamma_n, end (B,). Only TERMINAL stops the sum: a time limit ends the flight, but not the
+    world. q2 (B, A): Q^(s2, .), which says what an action is worth. q2_online (B, A): the values by
+    which a2 is chosen. In the textbook these are q2 too.
+
+    [+double] Let two actions be worth 0, and let Q^ guess 1 and -1. The max is 1: too high. So Q
+    chooses a2, and Q^ says what it is worth: where their mistakes differ, 1 and -1 are as likely.
     """
     a2 = q2_online.argmax(1, keepdim=True)  # (B, 1)
     v2 = q2.gather(1, a2)[:, 0]  # (B,) in NumPy: q2[arange(B), a2]
@@ -222,7 +231,15 @@ class Replay:
                              ^ write position      nor across the write position
 
     The s2 of a transition is the state of the next row. Only a truncated flight has a last state
-    that no row holds, so `last_frames` keeps its newest picture.
+    that no row holds, so `last_frames` keeps its newest picture. An example with one lane:
+
+        row        0    1    2    3    4    5
+        picture    A    B    C    D    E    F
+        reward     1    1   -10   0    0    2      the flight of rows 0 to 2 ends in a crash
+
+        stack of row 3: D D D D    of row 5: D D E F
+        window of row 1, n = 2: r = 1 + gamma * -10, and it ends there
+        window of row 3, n = 2: r = 0 + gamma * 0, and s2 is the stack of row 5
     """
 
     def __init__(self, capacity: int, lanes: int) -> None:
@@ -236,7 +253,7 @@ class Replay:
         self.added = 0  # rows ever written
 
     def add(self, s: ndarray, a: ndarray, r: ndarray, s2: ndarray, end: ndarray) -> None:
-        """Write one transition a lane (line 11): s, s2 (L, 4, 84, 84), a, r, end (L,)."""
+        """Write one transition per lane (line 11): s, s2 (L, 4, 84, 84), a, r, end (L,)."""
         row = self.added % self.rows
         self.frames[row], self.actions[row] = s[:, -1], a
         self.rewards[row], self.ends[row] = r, end
@@ -250,7 +267,7 @@ class Replay:
         """Draw transitions uniformly (line 12).
 
         Not the oldest three rows: the pictures that their stacks need may be overwritten. Not the
-        newest n rows: the rewards that their sums need are still to come.
+        newest n rows: their last rewards, or their s2, are still to come.
         """
         oldest = max(self.added - self.rows, 0) + 3
         row = rng.integers(oldest, self.added - n, size) % self.rows  # (B,)
@@ -262,7 +279,8 @@ class Replay:
 
         [+n_steps] With n = 2 the label is r_0 + gamma * r_1 + gamma^2 * max Q^(s_2, .): two true
         rewards, then the estimate. So the truth moves n states backwards with each update, and not
-        one. A window that meets the end of a flight stops there.
+        one. The price: if a_1 was a random action, the label is lower than the best could be. A
+        window that meets the end of a flight stops there.
         """
         last, r, power = row, self.rewards[row, lane], np.ones(len(row), np.float32)  # (B,)
         for _ in range(n - 1):
@@ -272,7 +290,7 @@ class Replay:
             r = r + live * power * self.rewards[last, lane]  # (B,)
         end = self.ends[last, lane]  # (B,)
         s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), lane)  # (B, 4, 84, 84)
-        for i in np.flatnonzero(end == TRUNCATED):
+        for i in np.flatnonzero(end == TRUNCATED):  # (after TERMINAL any s2 will do)
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], lane[i]]]
         a = self.actions[row, lane].astype(np.int64)  # (B,)
         return Batch(self.stack(row, lane), a, r, s2, power * np.float32(gamma), end)
@@ -282,7 +300,8 @@ class Replay:
         rows = [row]
         for _ in range(3):
             before = (rows[0] - 1) % self.rows  # (B,)
-            rows.insert(0, np.where(self.ends[before, lane] == LIVE, before, rows[0]))
+            same_flight = self.ends[before, lane] == LIVE  # (B,) else repeat the first picture
+            rows.insert(0, np.where(same_flight, before, rows[0]))
         return self.frames[np.stack(rows, 1), lane[:, None]]
 
 

@@ -39,8 +39,10 @@ arrival, or by leaving the forest. No more reward can follow. It is **truncated*
 clock ends it, after 1,000 steps: the drone was still flying, and more reward would have followed.
 Whoever learns from the flight must not confuse the two.
 
-pymunk moves the drone and measures d_obs; render.py draws what it sees. A flight is a deterministic
-function of its seed and its actions. Keep those two and you can fly it again, picture by picture.
+Each step is: turn, fly 0.5 m, sense (d_obs, d_goal), judge (is it over?), reward, look. pymunk, a
+physics library, moves the drone and measures d_obs. render.py draws what the drone sees. A flight
+is a deterministic function of its seed and its actions. Keep those two and you can fly it again,
+picture by picture.
 
 Legend
     d_obs     m, from the drone's centre to the nearest bark, at most the laser's 20 m
@@ -160,12 +162,12 @@ class ForestEnv:
         self.bark = [pymunk.Circle(ground, radius) for _ in grid(self.world)]
         self.drone = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self.space.add(self.drone, *self.bark)
-        self.seed, self.outcome, self.actions = -1, "not reset", []  # it counts as landed
+        self.seed, self.outcome, self.actions = -1, "not reset", []  # any outcome counts as landed
 
     def reset(self, *, seed: int | None = None, options: object = None) -> tuple[ndarray, dict]:
         """Plant forest number `seed`, or the one after the last, and stand at the start.
 
-        Draws nothing from anywhere: the forest is a function of the seed. `options` is unused.
+        Uses no random generator: the forest is a function of the seed. `options` is unused.
         """
         self.place(self.seed + 1 if seed is None else seed)
         self.observation = np.repeat(look([self]), STACK, 0)  # (4, 84, 84)
@@ -186,8 +188,8 @@ class ForestEnv:
         """All of a reset but the looking."""
         self.trunks, self.seed = plant(seed, self.world), seed  # (N, 2)
         for circle, centre in zip(self.bark, self.trunks.tolist(), strict=True):
-            circle.unsafe_set_offset(centre)  # a tenth of the time of new circles
-        self.space.reindex_static()
+            circle.unsafe_set_offset(centre)  # moves a trunk, ten times as fast as a new one
+        self.space.reindex_static()  # tells pymunk that they moved
         self.drone.position, self.drone.angle, self.pose = (0.0, 0.0), 0.0, (0.0, 0.0, 0.0)
         self.actions, self.progress, self.total = [], 0.0, 0.0
         self.outcome, self.edge, self.terminated, self.truncated = "", "", False, False
@@ -204,7 +206,7 @@ class ForestEnv:
         heading = self.drone.angle + yaw_rate * self.world.dt  # rad: turn first, then fly
         self.drone.velocity = pymunk.Vec2d.from_polar(self.world.speed, heading)
         self.drone.angular_velocity = yaw_rate
-        self.space.step(self.world.dt)
+        self.space.step(self.world.dt)  # pymunk moves the drone for dt seconds
         self._sense()
         self.outcome = self._judge()
         self.terminated, self.truncated = self.outcome not in ("", "time"), self.outcome == "time"
@@ -342,7 +344,7 @@ class Fleet:
         return [[(seed, "".join(map(str, a))) for seed, a in lane] for lane in self.records]
 
 
-# -------------------------------------------------- pilots that need no network
+# -------------------------------------------------- pilots that need no network: skim these
 
 Pilot = Callable[[Fleet], Sequence[int]]  # an action for each drone in the air
 Flights = list[dict[str, Any]]  # of ForestEnv.flight
@@ -381,7 +383,7 @@ def dynamic_window(bearings: ndarray, distances: ndarray, goal_bearing: float, w
 
 
 def fly(pilot: Pilot, seeds: Sequence[int], world: World, *, camera: bool = True) -> Flights:
-    """Fly one forest a seed, a hundred at once; returns the flights in the order of the seeds."""
+    """Fly one forest per seed, a hundred at once; returns the flights in the order of the seeds."""
     flights: Flights = []
     fleet = Fleet(world, min(len(seeds), 100), camera=camera)
     for group in (seeds[i : i + 100] for i in range(0, len(seeds), 100)):
@@ -419,7 +421,7 @@ def show(text: str) -> None:
 # -------------------------------------------------- legal worlds: skip this on a first reading
 
 # A world's numbers may go from 0.001 to 10,000; these have other limits. There are at most ten
-# actions, because a flight's record has one digit an action.
+# actions, because a flight's record has one digit per action.
 LIMITS = dict.fromkeys(("first_x", "first_y", "r_safe", "r_precrash", "r_crash"), (-1e4, 1e4))
 LIMITS |= dict.fromkeys(("back", "jitter_x", "jitter_y", "beacon_pixels", "yaw_rate"), (0, 1e4))
 LIMITS |= dict.fromkeys(("sky", "ground", "trunk_facing", "trunk_grazing", "beacon_grey"), (0, 255))

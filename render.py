@@ -37,6 +37,10 @@ The two rules of a pinhole camera:
   * A point h metres above the eye at depth z shows at row 41.5 - 42 * h / z. Depth is measured
     along the optical axis. With the distance along the ray instead, straight walls would look bent.
 
+A picture, in words: for each column, cast its ray. If it hits bark, work out the depth, and from it
+the rows of the trunk's top and foot. Fill the rows between with dark grey, which fades into the
+sky's grey with distance. All other rows are sky above the horizon, and ground below.
+
 Legend
     N  trunks
     M  rays
@@ -133,7 +137,7 @@ def silhouette(distance: ndarray, height: float, scene: Scene) -> ndarray:
     """Pixels (84, E * 84) bool that walls of this height cover, at distance (E * 84,) m."""
     depth = (distance.reshape(-1, PIXELS) * COSINES).ravel()  # (E * 84,) m
     above = np.array([[height - scene.altitude], [-scene.altitude]])  # (2, 1) m, top and foot
-    rows = np.ceil(CENTRE - FOCAL * above / depth)  # (2, E * 84) the first, and the first beyond
+    rows = np.ceil(CENTRE - FOCAL * above / depth)  # (2, E * 84) inf: both 42, so nothing between
     top, end = np.minimum(np.maximum(rows, 0), PIXELS).astype(np.uint8)  # (E * 84,) each
     return (top <= ROWS) & (end > ROWS)
 
@@ -154,6 +158,7 @@ def camera(
     eye = np.repeat(np.arange(eyes), [len(forest) for forest in trunks])  # (N,) who looks at it
     body = np.concatenate(body)  # (N, 2) m, every trunk in the axes of the drone that looks at it
     ahead, left = body.T  # (N,), (N,) m
+    # Only what may be in the picture: ahead, in view, and between its two edges at 45 degrees.
     near = (ahead > 0) & (ahead < scene.view) & (np.abs(left) < ahead + 2 * scene.trunk_radius)
     distance, facing = raycast(
         body[near], scene.trunk_radius, BEARINGS, eye[near], eyes
@@ -162,13 +167,13 @@ def camera(
     trunk = silhouette(distance, scene.trunk_height, scene)  # (84, E * 84)
     grey = fade(bark, distance, scene).astype(np.uint8)  # (E * 84,)
     behind = backdrop(scene)  # (84, 1)
-    # Bark where there is a trunk. Below zero uint8 starts again at 255, and the sum undoes it.
+    # np.where(trunk, grey, behind), but quicker: uint8 wraps below 0, and the sum undoes it.
     frames = behind + trunk * (grey - behind)  # (84, E * 84)
     if beacon is not None:
         goal = (np.subtract(beacon, at)[:, None] @ turn)[:, 0]  # (E, 2) m, ahead and left
         least = scene.beacon_pixels / 2 / FOCAL * goal[:, 0]  # (E,) m, the least radius to draw
         scale = np.maximum(scene.beacon_radius, least) / scene.trunk_radius  # (E,)
-        # A pole twice as wide and twice as far away looks the same.
+        # raycast knows one radius. A pole half as wide and half as far away looks the same.
         near_goal = goal / scale[:, None]  # (E, 2) m
         to_pole, _ = raycast(near_goal, scene.trunk_radius, BEARINGS, np.arange(eyes), eyes)
         to_pole *= np.repeat(scale, PIXELS)  # (E * 84,) m
@@ -177,7 +182,7 @@ def camera(
     return np.ascontiguousarray(frames.reshape(PIXELS, eyes, PIXELS).swapaxes(0, 1))
 
 
-# -------------------------------------------------- pictures for people, not for the network
+# -------------------------------------------------- pictures for people: skip this at first
 
 SCALE = 8  # px a metre on the map
 MARGIN = 4.0  # m around the forest
