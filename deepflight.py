@@ -384,7 +384,8 @@ class Run:
         q = self.agent.mean.module if late else self.agent.q
         row = {"step": book["step"], "episodes": book["episodes"], "updates": self.agent.updates}
         row["epsilon"] = epsilon
-        flown = {"train": book["recent"], "test": fly(dqn_pilot(q), TESTS, self.fleet.world)}
+        recent = book["recent"] or [env.flight() for env in self.fleet.envs]  # if none has landed
+        flown = {"train": recent, "test": fly(dqn_pilot(q), TESTS, self.fleet.world)}
         for who, flights in flown.items():
             row |= {f"{who}_{key}": x.mean().item() for key, x in measure(flights).items()}
         row["test_over_random"] = row["test_steps"] / book["bar"] - 1
@@ -454,10 +455,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     commands = parser.add_subparsers(dest="command", required=True)
     sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
     sub.set_defaults(run=start_training, preset="default", name="", resume=None)
-    sub.add_argument("--preset", choices=("default", "mnih"))
-    which = sub.add_mutually_exclusive_group()
-    which.add_argument("--name", help="of the folder in runs/; else a fresh number")
-    which.add_argument("--resume", type=Path, help="the folder to go on in")
+    sub.add_argument("--preset", choices=("default", "mnih"), help="mnih: [Mnih15]'s parameters")
+    sub.add_argument("--name", help="name of the folder in runs/; by default a new number")
+    sub.add_argument("--resume", type=Path, help="folder of a training to go on with")
     for f in SETTINGS:
         kind = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type}
         sub.add_argument("--" + f.name.replace("_", "-"), help=f.metadata["help"], **kind)
@@ -479,7 +479,7 @@ def start_training(args: argparse.Namespace) -> int:
     given = {f.name: vars(args)[f.name] for f in SETTINGS if f.name in args}
     if args.resume:
         saved = dqn.load(args.resume / "checkpoint.pt", "checkpoint")
-        if given.keys() - {"steps"} or args.preset != "default":
+        if given.keys() - {"steps"} or args.name or args.preset != "default":
             raise ValueError(f"{args.resume} keeps its own settings: give none but --steps")
         if saved["machine"] != dqn.MACHINE:
             raise ValueError(f"{args.resume} is of {saved['machine']}, here is {dqn.MACHINE}")

@@ -215,12 +215,14 @@ class ForestEnv:
         return r
 
     def _sense(self) -> None:
-        before, self.pose = self.pose[0], (*self.drone.position, self.drone.angle)
-        at, reach = self.pose[:2], self.world.laser_range
-        self.forward, self.progress = at[0] - before, max(self.progress, at[0])
-        bark = self.space.point_query_nearest(at, reach, EVERYTHING)
+        x_before, self.pose = self.pose[0], (*self.drone.position, self.drone.angle)
+        x, y, _ = self.pose
+        self.forward = x - x_before
+        self.progress = max(self.progress, x)
+        reach = self.world.laser_range
+        bark = self.space.point_query_nearest((x, y), reach, EVERYTHING)  # None: out of reach
         self.d_obs = bark.distance if bark else reach
-        self.d_goal = math.dist(at, self.goal)
+        self.d_goal = math.dist((x, y), self.goal)
 
     def _judge(self) -> str:
         if self.d_obs < self.world.d_crash:
@@ -261,7 +263,7 @@ class ForestEnv:
         return math.remainder((self.goal - (x, y)).angle - heading, math.tau)
 
 
-EVERYTHING = pymunk.ShapeFilter()
+EVERYTHING = pymunk.ShapeFilter()  # a query that leaves nothing out
 
 
 def look(envs: Sequence[ForestEnv]) -> ndarray:
