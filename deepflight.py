@@ -69,7 +69,7 @@ class RunConfig:
     beacon: bool = dqn.setting(False, "put a visible pole at the goal", 0, 1)
     threads: int = dqn.setting(2, "of the CPU; other numbers give other last digits", 1, 256)
     test_every: int = dqn.setting(5_000, "control steps between test points, which also save", 1)
-    forward_reward: float = dqn.setting(6.0, "[+] for a metre nearer the far edge; 0: off", 0, 1e3)
+    forward_reward: float = dqn.setting(6.0, "[+] paid per metre flown forward; 0: off", 0, 1e3)
     goal_value: float = dqn.setting(125.0, "[+] worth of arrival at the goal; 0: off", -1e6, 1e6)
     far_value: float = dqn.setting(200.0, "[+] worth of leaving by the far edge; 0: off", -1e6, 1e6)
 
@@ -111,9 +111,9 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
     was found by trial. It is more than 125, so this pilot crosses often and seldom arrives.
 
     The field calls this reward shaping. A policy is a rule that picks the action in every state.
-    Some shaping provably leaves the best policy as it is: it is the difference of a potential
-    between two states [Ng 1999]. Ours is not of that kind, and is meant to change the policy. Only
-    the learner sees it. Every reward that is printed or logged is the paper's.
+    Shaping of one kind provably leaves the best policy as it is: to pay gamma * h(s2) - h(s), for
+    some score h of the states [Ng 1999]. Ours is not of that kind, and is meant to change the
+    policy. Only the learner sees it. Every reward that is printed or logged is the paper's.
     """
     forward = np.array([info["forward"] for info in infos])  # (L,) m
     arrived = np.array([info.get("outcome") == "goal" for info in infos])  # (L,)
@@ -137,8 +137,14 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #             move the weights of Q a little against the gradient of the loss
 #             every so many updates: Q^ = Q
 #
-# `train` is this loop, and the pieces marked [+name]. `run` (class Run, below) counts the steps, 8
-# at a time because 8 drones fly, says how many updates or tests are due, tests, saves and stops.
+# `train` is this loop, and the pieces marked [+name]. What belongs to files, tests and clocks is
+# asked of `run` (class Run, below):
+#
+#     run.steps()       8, 16, 24, ...: eight drones fly, so each pass makes eight control steps
+#     run.due(4)        how many multiples of 4 are among them: two updates fall due on each pass
+#     run.last_share    whether this is the last tenth of all steps
+#     run.note()        counts flights, shows progress
+#     run.test()        flies the test forests, writes log.csv, keeps the best weights in best.pt
 
 
 def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | None = None) -> int:
@@ -154,8 +160,8 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
         # [+lr_decay] The learning rate: large strides at first, small ones to settle.
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)
         agent.optimizer.param_groups[0]["lr"] = lr
-        # [+huber] The loss of an error e is e^2 / (2 delta) up to delta, |e| - delta / 2 beyond.
-        # All errors beyond pull alike, which is steady at first; later a crash must weigh more.
+        # [+huber] The loss of an error e is e^2 / (2 delta) up to delta, |e| - delta / 2 beyond. If
+        # delta is 1, an error of 50 pulls like one of 1: that is steady, but a crash counts little.
         delta = c.huber if step > c.huber_after else 1.0
 
         fleet.reset(fleet.landed, rng.integers(TRAIN_END, size=len(fleet.landed)))  # 4, 5
@@ -187,7 +193,7 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
             agent.updates += 1
             if agent.updates % c.target_every == 0:
                 agent.q_target.load_state_dict(agent.q.state_dict())  # 15
-            if run.last_share:  # [+average] each update changes how Q flies; their mean is steady
+            if run.last_share:  # [+average] each update changes how Q flies, and a mean hardly
                 agent.mean.update_parameters(agent.q)
 
         run.note()

@@ -31,7 +31,7 @@ the end of a flight the whole label is true. Take a flight of three steps with r
 -10. To keep it small, let there be one action only, so that the max is its Q. Let all Q be 0 at
 first, and let every update go all the way to its label:
 
-                  Q of step 1   step 2   step 3
+                  Q of step 1   step 2   step 3   (each row from the row above it)
     after update 1    0.5         0.5     -10     the crash is known
     after update 2    1.0        -9.4     -10     0.5 + 0.99 * -10 = -9.4
     after update 3   -8.8        -9.4     -10     0.5 + 0.99 * -9.4 = -8.8: all three are true
@@ -80,7 +80,8 @@ mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, 
     optimizer.step()   move every weight a little against it; the learning rate says how far
     q.gather(1, a)     in NumPy: q[arange(len(q)), a]
 
-A mark like [+double] means: not in the textbook. The name is the setting that switches it off.
+A mark like [+double] means: not in the textbook. The name is the setting that switches it off. As
+textbook we count [Mnih15], which also cuts the gradient of errors beyond 1.
 
 Legend
     s, a      state and action
@@ -114,8 +115,10 @@ from numpy.random import Generator
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-# How a transition ended: not at all; by the clock alone, so more rewards would have followed; or in
-# the world itself, so none can follow. env.py tells more.
+# How a transition ended (env.py tells more):
+# LIVE       not at all
+# TRUNCATED  by the clock alone, so more rewards would have followed
+# TERMINAL   in the world itself, so no more rewards can follow
 LIVE, TRUNCATED, TERMINAL = range(3)
 
 
@@ -200,11 +203,12 @@ def td_target(r: Tensor, gamma_n: Tensor, end: Tensor, q2: Tensor, q2_online: Te
     world. q2 (B, A): Q^(s2, .), which says what an action is worth. q2_online (B, A): the values by
     which a2 is chosen. In the textbook these are q2 too.
 
-    [+double] Let two actions be worth 0, and let Q^ guess 1 and -1. The max is 1: too high. So Q
-    chooses a2, and Q^ says what it is worth: where their mistakes differ, 1 and -1 are as likely.
+    [+double] Let two actions both be worth 0 in truth. Q^ errs by +1 and -1, so its max is 1: too
+    high, always. Let Q choose a2 instead. Its errors are other ones, so half of the time it takes
+    the action that Q^ values at -1. On average the label is right.
     """
     a2 = q2_online.argmax(1, keepdim=True)  # (B, 1)
-    v2 = q2.gather(1, a2)[:, 0]  # (B,) in NumPy: q2[arange(B), a2]
+    v2 = q2.gather(1, a2)[:, 0]  # (B,) the q2 of a2; if q2_online is q2, the max
     return r + gamma_n * torch.where(end == TERMINAL, 0.0, v2)
 
 
@@ -230,8 +234,9 @@ class Replay:
         lane 1   x x x x x x x|x x x x             n-step window reaches across it,
                              ^ write position      nor across the write position
 
-    The s2 of a transition is the state of the next row. Only a truncated flight has a last state
-    that no row holds, so `last_frames` keeps its newest picture. An example with one lane:
+    The s2 of a transition is the state of the next row. After a crash no s2 is needed. After the
+    time limit it is needed and no row holds it, so `last_frames` keeps its newest picture. An
+    example with one lane:
 
         row        0    1    2    3    4    5
         picture    A    B    C    D    E    F
@@ -267,7 +272,7 @@ class Replay:
         """Draw transitions uniformly (line 12).
 
         Not the oldest three rows: the pictures that their stacks need may be overwritten. Not the
-        newest n rows: their last rewards, or their s2, are still to come.
+        newest n rows: they need rows that are not written yet.
         """
         oldest = max(self.added - self.rows, 0) + 3
         row = rng.integers(oldest, self.added - n, size) % self.rows  # (B,)
@@ -277,11 +282,12 @@ class Replay:
     def window(self, row: ndarray, lane: ndarray, n: int, gamma: float) -> Batch:
         """The transitions that start at row (B,), lane (B,), each over n steps.
 
-        [+n_steps] With n = 2 the label is r_0 + gamma * r_1 + gamma^2 * max Q^(s_2, .): two true
-        rewards, then the estimate. So the truth moves n states backwards with each update, and not
-        one. The price: if a_1 was a random action, the label is lower than the best could be. A
-        window that meets the end of a flight stops there.
+        [+n_steps] With n = 2 the label of Q(s_0, a_0) is r_0 + gamma * r_1 + gamma^2 * max Q^(s_2,
+        .): two true rewards, then the estimate. So the truth moves n states backwards with each
+        update, and not one. The price: r_1 followed from the action that was taken in s_1. If that
+        was not the best one, the label is too low. A window stops at the end of a flight.
         """
+        # last: the row of the newest reward in r. power: gamma^k for the reward k steps on.
         last, r, power = row, self.rewards[row, lane], np.ones(len(row), np.float32)  # (B,)
         for _ in range(n - 1):
             live = self.ends[last, lane] == LIVE  # (B,) the flight goes on: take one more step
@@ -303,6 +309,39 @@ class Replay:
             same_flight = self.ends[before, lane] == LIVE  # (B,) else repeat the first picture
             rows.insert(0, np.where(same_flight, before, rows[0]))
         return self.frames[np.stack(rows, 1), lane[:, None]]
+
+
+class Agent(nn.Module):
+    """All that learning changes: Q, Q^, the optimizer, and the mean of Q's last weights."""
+
+    def __init__(self, c: DQNConfig, actions: int, seed: int) -> None:
+        super().__init__()
+        self.updates, self.loss, self.bfloat16 = 0, torch.zeros(()), c.bfloat16 and HAS_BFLOAT16
+        layout = torch.channels_last  # the order in memory in which convolutions are quickest
+        with torch.random.fork_rng():  # torch draws the first weights from its own generator:
+            torch.manual_seed(seed % 2**64)  # lend it our seed, then put its state back
+            self.q = QNetwork(actions).to(memory_format=layout)  # line 2
+            self.q_target = QNetwork(actions).to(memory_format=layout)
+        self.q_target.load_state_dict(self.q.state_dict())  # line 3
+        self.mean = AveragedModel(self.q)  # [+average]
+        self.optimizer = make_optimizer(self.q.parameters(), c)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What a checkpoint needs besides weights; PyTorch's state_dict calls this."""
+        return {"optimizer": self.optimizer.state_dict(), "updates": self.updates}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Take it up again; PyTorch's load_state_dict calls this."""
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.updates = state["updates"]
+
+
+def make_optimizer(theta: Any, c: DQNConfig) -> torch.optim.Optimizer:
+    """[+adam] Adam gives each weight a stride of its own and needs little tuning. Without it: an
+    RMSprop after [Mnih15]. theta: the weights."""
+    if c.adam:
+        return torch.optim.Adam(theta, c.lr, eps=1.5e-4, fused=True)
+    return torch.optim.RMSprop(theta, c.lr, alpha=0.95, eps=0.01, momentum=0.95, centered=True)
 
 
 # -------------------------------------------------- what is not in the textbook
@@ -328,39 +367,6 @@ def linear_schedule(step: int, first: float, final: float, steps: int) -> float:
     [1.0, 0.55, 0.1, 0.1]
     """
     return final + (first - final) * max(1 - step / steps, 0)
-
-
-class Agent(nn.Module):
-    """All that learning changes: Q, Q^, the optimizer, and the mean of Q's last weights."""
-
-    def __init__(self, c: DQNConfig, actions: int, seed: int) -> None:
-        super().__init__()
-        self.updates, self.loss, self.bfloat16 = 0, torch.zeros(()), c.bfloat16 and HAS_BFLOAT16
-        layout = torch.channels_last  # the order in memory in which convolutions are quickest
-        with torch.random.fork_rng():  # torch draws the first weights from its own generator:
-            torch.manual_seed(seed % 2**64)  # lend it our seed, then put its state back
-            self.q = QNetwork(actions).to(memory_format=layout)  # line 2
-            self.q_target = QNetwork(actions).to(memory_format=layout)
-        self.q_target.load_state_dict(self.q.state_dict())  # line 3
-        self.mean = AveragedModel(self.q)
-        self.optimizer = make_optimizer(self.q.parameters(), c)
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """What a checkpoint needs besides weights; PyTorch's state_dict calls this."""
-        return {"optimizer": self.optimizer.state_dict(), "updates": self.updates}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take it up again; PyTorch's load_state_dict calls this."""
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.updates = state["updates"]
-
-
-def make_optimizer(theta: Any, c: DQNConfig) -> torch.optim.Optimizer:
-    """[+adam] Adam gives each weight a stride of its own and needs little tuning. Without it: an
-    RMSprop after [Mnih15]. theta: the weights."""
-    if c.adam:
-        return torch.optim.Adam(theta, c.lr, eps=1.5e-4, fused=True)
-    return torch.optim.RMSprop(theta, c.lr, alpha=0.95, eps=0.01, momentum=0.95, centered=True)
 
 
 # Where the processor has no bfloat16 of its own, float32 is quicker.

@@ -20,7 +20,7 @@ the drone what to do. To fly well is to collect much reward over a whole flight.
     | in the air, d_obs > 2.0 m            | r_safe + r_goal                                     |
     | in the air, d_obs from 2.0 to 0.75 m | r_near + r_goal                                     |
     | in a crash, d_obs < 0.75 m           | r_crash                                             |
-    | outside, beyond any edge             | r_crash                                             |
+    | outside, beyond any edge (x < -2 too)| r_crash                                             |
     | at the goal, or out of time          | as in the air                                       |
 
     r_safe = 0.25    r_crash = -10    r_goal = 1 - d_goal / d_max, 0 at the start and 1 at the goal
@@ -73,7 +73,7 @@ from numpy import ndarray
 from render import PIXELS, Scene, camera, raycast
 
 STACK = 4  # pictures in an observation [DF §II-A]
-OUTCOMES = ("crash", "goal", "left", "time")  # tested in this order
+OUTCOMES = ("crash", "goal", "left", "time")  # tested in this order; left: the forest, by an edge
 
 
 @dataclass(frozen=True)
@@ -288,8 +288,8 @@ def refly(seed: int, actions: Iterable, world: World, *, camera: bool = True) ->
 
 
 class Fleet:
-    """L drones that fly side by side, each through its own forest. Gymnasium calls such an object,
-    which steps many environments with one call, a vector environment.
+    """L drones that fly side by side, each through its own forest: a ForestEnv L times, where only
+    the drawing is shared. Gymnasium calls such an object a vector environment.
 
     One camera call draws what all of them see, which is quicker than a call for each. A drone that
     has landed waits, and takes no action, until its lane is reset. Each lane keeps a record of its
@@ -339,7 +339,7 @@ class Fleet:
         return s2, np.array(r), terminated, truncated, [env.info() for env in envs]
 
     def record(self, steps: int) -> list[list[tuple[int, str]]]:
-        """For every lane the flights that its last so many steps belong to: seeds and actions."""
+        """For checkpoints: for every lane, seed and actions of the flights of its last steps."""
         for flights in self.records:
             while sum(len(actions) for _, actions in flights[1:]) >= steps:
                 flights.pop(0)

@@ -89,7 +89,7 @@ class Scene:
     ground: int = 60
     trunk_facing: int = 35  # bark seen head-on
     trunk_grazing: int = 0  # bark seen edge-on
-    beacon_grey: int = 140  # brighter than all else; from a white pole pilots turned away
+    beacon_grey: int = 140  # brighter than all else; pilots turned away from a white pole
 
 
 def raycast(
@@ -115,7 +115,7 @@ def raycast(
     order = np.argsort(-distance)  # (H,) far to near: the nearest is written last, and stays
     order = order[distance[order] > 0]
     trunk, ray = meet[order] // rays, meet[order] % rays  # (H,), (H,)
-    place = ray if eye is None else eye[trunk] * rays + ray  # (H,) in the result
+    place = ray if eye is None else eye[trunk] * rays + ray  # (H,) eye 1's rays follow eye 0's
     first, facing = np.full(eyes * rays, np.inf), np.zeros(eyes * rays)  # (E * M,), (E * M,)
     first[place], facing[place] = distance[order], half_chord[order] / radius
     return first, facing
@@ -128,7 +128,10 @@ def fade(grey: ndarray, distance: ndarray, scene: Scene) -> ndarray:
 
 @cache
 def backdrop(scene: Scene) -> ndarray:
-    """Sky above the horizon, and ground that fades towards it, as one column (84, 1) uint8."""
+    """Sky above the horizon, and ground that fades towards it, as one column (84, 1) uint8.
+
+    A row below the horizon, of slope -t, sees the ground at depth altitude / t.
+    """
     depth = np.where(SLOPES < 0, scene.altitude / np.abs(SLOPES), np.inf)  # (84,) m
     return fade(np.float64(scene.ground), depth, scene).astype(np.uint8)[:, None]
 
@@ -167,7 +170,7 @@ def camera(
     trunk = silhouette(distance, scene.trunk_height, scene)  # (84, E * 84)
     grey = fade(bark, distance, scene).astype(np.uint8)  # (E * 84,)
     behind = backdrop(scene)  # (84, 1)
-    # np.where(trunk, grey, behind), but quicker: uint8 wraps below 0, and the sum undoes it.
+    # np.where(trunk, grey, behind), but quicker. In uint8 35 - 60 is 231, and 60 + 231 is 35 again.
     frames = behind + trunk * (grey - behind)  # (84, E * 84)
     if beacon is not None:
         goal = (np.subtract(beacon, at)[:, None] @ turn)[:, 0]  # (E, 2) m, ahead and left
