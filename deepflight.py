@@ -7,8 +7,8 @@
     python deepflight.py eval                   fly weights/paper.pt against three other pilots
     python deepflight.py eval --beacon          fly weights/beacon.pt where the goal is visible
 
-The story stands first: the settings, what the learner is paid, `train`, `evaluate`. Statistics and
-plumbing (files, signals, clocks, the command line) stand last; a first reading may skip them.
+The story stands first: the settings, what the network is paid, `train`, `evaluate`. Statistics,
+film and plumbing (files, signals, clocks, the command line) stand last. Skip them at first.
 
 `train` prints a row at every test point:
 
@@ -86,7 +86,7 @@ MNIH = dict(
 )  # fmt: skip
 
 
-# -------------------------------------------------- what the learner is paid
+# -------------------------------------------------- what the network is paid
 
 
 def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: float) -> ndarray:
@@ -113,7 +113,7 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
     The field calls this reward shaping. A policy is a rule that picks the action in every state.
     Shaping of one kind provably leaves the best policy as it is: to pay gamma * h(s2) - h(s), for
     some score h of the states [Ng 1999]. Ours is not of that kind, and is meant to change the
-    policy. Only the learner sees it. Every reward that is printed or logged is the paper's.
+    policy. Only the network sees it. Every reward that is printed or logged is the paper's.
     """
     forward = np.array([info["forward"] for info in infos])  # (L,) m
     arrived = np.array([info.get("outcome") == "goal" for info in infos])  # (L,)
@@ -235,35 +235,7 @@ def evaluate(args: argparse.Namespace) -> int:
     return 0
 
 
-@torch.no_grad()
-def film(flown: dict[str, dict], world: World, q: QNetwork) -> Iterator[render.Image.Image]:
-    """The pictures of the last pilot's flight: what it sees, its Q, a map with all pilots' ways."""
-    *others, (name, flight) = flown.items()
-    trunks, title = env.plant(flight["seed"], world), f"forest {flight['seed']}"
-    chart = render.draw_map(trunks, (world.length, world.width), title)
-    chart = render.draw_ways(chart, [(*track(f, world), pilot) for pilot, f in others])
-    (path, end), total = track(flight, world), 0.0
-    for t, (s, r, *_, info) in enumerate(refly(flight["seed"], flight["actions"], world)):
-        total += r
-        action, ended = (int(flight["actions"][t]), "") if t < flight["steps"] else (-1, end)
-        if t % (1 + flight["steps"] // 300) and not ended:
-            continue  # of a long flight not every step is filmed
-        seen = render.draw_ways(chart, [(path[: t + 1], ended, name)])
-        values = q(torch.from_numpy(s)[None])[0].numpy() if name == "dqn" else None  # (A,)
-        clock = f"{t * world.dt:.1f} s, {info['d_goal']:.1f} m to the goal"
-        lines = (f"{name}: {clock}", f"reward so far {total:.1f}", render.ENDS[ended])
-        panel = render.draw_panel(s[-1], seen, values, action, lines)
-        yield panel
-    yield from [panel] * 20  # the end stays for two seconds
-
-
-def track(flight: dict[str, Any], world: World) -> tuple[ndarray, str]:
-    """Where a flight went (T, 2) in m, by flying it again, and its edge or outcome."""
-    steps = refly(flight["seed"], flight["actions"], world, camera=False)
-    return np.array([info["pose"][:2] for *_, info in steps]), flight["edge"] or flight["outcome"]
-
-
-# -------------------------------------------------- statistics: skip them on a first reading
+# -------------------------------------------------- statistics, film: skip on a first reading
 
 
 def summarize(flights: Flights, bar: Flights, forests: int, rng: Generator) -> dict[str, dict]:
@@ -314,6 +286,34 @@ def print_table(figures: dict[str, dict]) -> None:
     for key, (label, factor, digits) in ROWS.items():
         cells = [[f"{factor * x:.{digits}f}" for x in p[key].values()] for p in figures.values()]
         print(f"{label:12}" + "".join(f"{f'{x} [{low}, {high}]':>17}" for x, low, high in cells))
+
+
+@torch.no_grad()
+def film(flown: dict[str, dict], world: World, q: QNetwork) -> Iterator[render.Image.Image]:
+    """The pictures of the last pilot's flight: what it sees, its Q, a map with all pilots' ways."""
+    *others, (name, flight) = flown.items()
+    trunks, title = env.plant(flight["seed"], world), f"forest {flight['seed']}"
+    chart = render.draw_map(trunks, (world.length, world.width), title)
+    chart = render.draw_ways(chart, [(*track(f, world), pilot) for pilot, f in others])
+    (path, end), total = track(flight, world), 0.0
+    for t, (s, r, *_, info) in enumerate(refly(flight["seed"], flight["actions"], world)):
+        total += r
+        action, ended = (int(flight["actions"][t]), "") if t < flight["steps"] else (-1, end)
+        if t % (1 + flight["steps"] // 300) and not ended:
+            continue  # of a long flight not every step is filmed
+        seen = render.draw_ways(chart, [(path[: t + 1], ended, name)])
+        values = q(torch.from_numpy(s)[None])[0].numpy() if name == "dqn" else None  # (A,)
+        clock = f"{t * world.dt:.1f} s, {info['d_goal']:.1f} m to the goal"
+        lines = (f"{name}: {clock}", f"reward so far {total:.1f}", render.ENDS[ended])
+        panel = render.draw_panel(s[-1], seen, values, action, lines)
+        yield panel
+    yield from [panel] * 20  # the end stays for two seconds
+
+
+def track(flight: dict[str, Any], world: World) -> tuple[ndarray, str]:
+    """Where a flight went (T, 2) in m, by flying it again, and its edge or outcome."""
+    steps = refly(flight["seed"], flight["actions"], world, camera=False)
+    return np.array([info["pose"][:2] for *_, info in steps]), flight["edge"] or flight["outcome"]
 
 
 # -------------------------------------------------- plumbing: skip it on a first reading

@@ -28,8 +28,8 @@ from render import save_film
 ROOT = Path(__file__).parents[2]
 PAPER = 1.8  # the paper's figure: 180 % more flight time than random [DF, abstract]
 PANELS = {  # column of log.csv -> title
-    "train_return": "Figure 2: return in training,\nmean of 100 flights",
-    "test_return": "Figure 3: return on the test forests",
+    "train_return": "Figure 2: total reward in training,\nmean of 100 flights",
+    "test_return": "Figure 3: total reward on the test forests",
     "test_steps": "Figure 4: flight time on the test forests, steps",
 }
 LABELS = {"paper": "the paper's world", "beacon": "with the beacon"}  # folder -> label
