@@ -12,7 +12,7 @@ film and plumbing (files, signals, clocks, the command line) stand last. Skip th
 
 `train` prints a row at every test point:
 
-     step   eps steps/s min left return | test: return over random crossed crash
+     step   eps steps/s min left reward | test: reward over random crossed crash
    10,000  0.76     198     24.4  -19.7          -43.0        204%      0%   15%
 
 The drones have flown 10,000 control steps, and 76 % of the actions are random at this point. The
@@ -77,7 +77,8 @@ class RunConfig:
 SETTINGS = (*fields(DQNConfig), *fields(RunConfig))
 # With the beacon the goal can be seen, so no other way out should be worth as much.
 BEACON = {"forward_reward": 0.0, "far_value": 50.0}
-# [Mnih15, Extended Data Table 1], as the paper says [DF §II-B]; 1.4 M steps are the paper's own.
+# [Mnih15, Extended Data Table 1], as the paper says [DF §II-B]. 1.4 M steps are the paper's own.
+# Eight drones still fly side by side.
 MNIH = dict(
     steps=1_400_000, replay_size=1_000_000, learning_starts=50_000, target_every=10_000,
     epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, double=False, n_steps=1, mirror=False,
@@ -141,7 +142,7 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 # asked of `run` (class Run, below):
 #
 #     run.steps()       8, 16, 24, ...: eight drones fly, so each pass makes eight control steps
-#     run.due(4)        how many multiples of 4 are among them: two updates fall due on each pass
+#     run.due(4)        how many multiples of 4 the eight of this pass hold: two updates are due
 #     run.last_share    whether this is the last tenth of all steps
 #     run.note()        counts flights, shows progress
 #     run.test()        flies the test forests, writes log.csv, keeps the best weights in best.pt
@@ -161,7 +162,8 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)
         agent.optimizer.param_groups[0]["lr"] = lr
         # [+huber] The loss of an error e is e^2 / (2 delta) up to delta, |e| - delta / 2 beyond. If
-        # delta is 1, an error of 50 pulls like one of 1: that is steady, but a crash counts little.
+        # delta is 1, an error of 50 pulls like one of 1: steady, good to begin with. If it is 100,
+        # it pulls 50 times as hard: rare crashes count in full.
         delta = c.huber if step > c.huber_after else 1.0
 
         fleet.reset(fleet.landed, rng.integers(TRAIN_END, size=len(fleet.landed)))  # 4, 5
@@ -177,14 +179,14 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
         for _ in range(run.due(c.update_every) if step >= c.learning_starts else 0):
             batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
             batch = mirror(batch, world.actions, rng) if c.mirror else batch  # [+mirror]
-            s, a, r, s2, gamma_n, end = map(torch.from_numpy, batch)  # (B, ...) of the batch
+            b = dqn.Batch(*map(torch.from_numpy, batch))
             with torch.no_grad():
-                q2 = agent.q_target(s2, agent.bfloat16)  # (B, A) [+bfloat16]
+                q2 = agent.q_target(b.s2, agent.bfloat16)  # (B, A) [+bfloat16]
                 # [+double] Q chooses a2, and Q^ says what it is worth.
-                q2_online = agent.q(s2, agent.bfloat16) if c.double else q2  # (B, A)
-                y = td_target(r, gamma_n, end, q2, q2_online)  # (B,) 13
-            q = agent.q(s, agent.bfloat16).gather(1, a[:, None])[:, 0]  # (B,)
-            agent.loss = torch.nn.functional.smooth_l1_loss(q, y, beta=delta)  # 14
+                q2_online = agent.q(b.s2, agent.bfloat16) if c.double else q2  # (B, A)
+                y = td_target(b.r, b.gamma_n, b.end, q2, q2_online)  # (B,) 13
+            q_sa = agent.q(b.s, agent.bfloat16).gather(1, b.a[:, None])[:, 0]  # (B,)
+            agent.loss = torch.nn.functional.smooth_l1_loss(q_sa, y, beta=delta)  # 14
             agent.optimizer.zero_grad()
             agent.loss.backward()
             if c.max_grad_norm:  # [+max_grad_norm] so that one strange batch cannot ruin Q
@@ -193,7 +195,7 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
             agent.updates += 1
             if agent.updates % c.target_every == 0:
                 agent.q_target.load_state_dict(agent.q.state_dict())  # 15
-            if run.last_share:  # [+average] each update changes how Q flies, and a mean hardly
+            if run.last_share:  # [+average] Q's flying jumps with every update; a mean is steady
                 agent.mean.update_parameters(agent.q)
 
         run.note()
@@ -213,7 +215,7 @@ def dqn_pilot(q: QNetwork) -> Pilot:
 
 def evaluate(args: argparse.Namespace) -> int:
     """Fly every pilot through the same forests; print the table, write pictures and JSON."""
-    q = check_eval(args)
+    q = load_pilot(args)
     torch.set_num_threads(RunConfig.threads)
     world, rng = World(beacon=args.beacon), np.random.default_rng(0)
     seeds = range(args.first_seed, args.first_seed + args.episodes)
@@ -318,7 +320,7 @@ def track(flight: dict[str, Any], world: World) -> tuple[ndarray, str]:
 
 # -------------------------------------------------- plumbing: skip it on a first reading
 
-HEAD = "     step   eps steps/s min left return | test: return over random crossed crash"
+HEAD = "     step   eps steps/s min left reward | test: reward over random crossed crash"
 ROW = "{step:9,}{epsilon:6.2f}{speed:8.0f}{eta:9.1f}{train_return:7.1f}{test_return:15.1f}"
 ROW += "{test_over_random:12.0%}{test_crossed:8.0%}{test_crash:6.0%}"
 
@@ -514,8 +516,8 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
     return c, rc
 
 
-def check_eval(args: argparse.Namespace) -> QNetwork:
-    """Check all that is given, before anything flies, and read the weights."""
+def load_pilot(args: argparse.Namespace) -> QNetwork:
+    """Read the weights; check all that is given, before anything flies."""
     for name, least in (("episodes", 1), ("first_seed", 0)):
         if (value := vars(args)[name]) < least:
             raise ValueError(f"{name} is {value}, allowed are whole numbers from {least}")

@@ -74,14 +74,14 @@ four pictures that we call s, and theta are the weights.
 PyTorch in six lines. The loss is one number that says how wrong a batch of outputs is, such as the
 mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, and how fast.
     q(s)               calls QNetwork.forward; a tensor is an array that remembers how it was made
-    torch.no_grad()    do not remember: nothing is to be learnt from what is computed here
+    torch.no_grad()    do not remember; so a label is a constant, and only Q(s, a) is moved
     optimizer.zero_grad()   forget the last gradient
     loss.backward()    compute the gradient
     optimizer.step()   move every weight a little against it; the learning rate says how far
-    q.gather(1, a)     in NumPy: q[arange(len(q)), a]
+    values.gather(1, a[:, None])[:, 0]      in NumPy: values[arange(len(a)), a]
 
 A mark like [+double] means: not in the textbook. The name is the setting that switches it off. As
-textbook we count [Mnih15], which also cuts the gradient of errors beyond 1.
+textbook we count what [Mnih15] ran: line 14, but an error beyond 1 pulls like an error of 1.
 
 Legend
     s, a      state and action
@@ -212,6 +212,15 @@ def td_target(r: Tensor, gamma_n: Tensor, end: Tensor, q2: Tensor, q2_online: Te
     return r + gamma_n * torch.where(end == TERMINAL, 0.0, v2)
 
 
+def linear_schedule(step: int, first: float, final: float, steps: int) -> float:
+    """The schedule of epsilon and the learning rate: from first to final in steps, then constant.
+
+    >>> [linear_schedule(t, 1.0, 0.1, 100) for t in (0, 50, 100, 1000)]
+    [1.0, 0.55, 0.1, 0.1]
+    """
+    return final + (first - final) * max(1 - step / steps, 0)
+
+
 class Batch(NamedTuple):
     """B transitions drawn from the replay."""
 
@@ -296,7 +305,7 @@ class Replay:
             r = r + live * power * self.rewards[last, lane]  # (B,)
         end = self.ends[last, lane]  # (B,)
         s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), lane)  # (B, 4, 84, 84)
-        for i in np.flatnonzero(end == TRUNCATED):  # (after TERMINAL any s2 will do)
+        for i in np.flatnonzero(end == TRUNCATED):  # no row holds s2: append its last picture
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], lane[i]]]
         a = self.actions[row, lane].astype(np.int64)  # (B,)
         return Batch(self.stack(row, lane), a, r, s2, power * np.float32(gamma), end)
@@ -358,15 +367,6 @@ def mirror(batch: Batch, actions: int, rng: Generator) -> Batch:
         frames[flip] = frames[flip, ..., ::-1]
     batch.a[flip] = actions - 1 - batch.a[flip]
     return batch
-
-
-def linear_schedule(step: int, first: float, final: float, steps: int) -> float:
-    """The schedule of epsilon and the learning rate: from first to final in steps, then constant.
-
-    >>> [linear_schedule(t, 1.0, 0.1, 100) for t in (0, 50, 100, 1000)]
-    [1.0, 0.55, 0.1, 0.1]
-    """
-    return final + (first - final) * max(1 - step / steps, 0)
 
 
 # Where the processor has no bfloat16 of its own, float32 is quicker.

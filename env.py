@@ -64,6 +64,7 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -139,6 +140,7 @@ def plant(seed: int, world: World) -> ndarray:
     return centres + np.random.default_rng(seed).uniform(-1, 1, centres.shape) * jitter
 
 
+@cache
 def grid(world: World) -> ndarray:
     """Trunk centres (N, 2) in m before jitter."""
     x = world.first_x + world.spacing_x * np.arange(world.rows)
@@ -331,12 +333,15 @@ class Fleet:
         infos, as ForestEnv.step does for one.
         """
         envs = self.flying
-        r = [env.advance(a) for env, a in zip(envs, actions, strict=True)]
-        for env, frame in zip(envs, look(envs), strict=True):
-            env.observation = np.concatenate([env.observation[1:], frame[None]])  # (4, 84, 84)
-        s2 = np.stack([env.observation for env in envs])  # (F, 4, 84, 84)
-        terminated, truncated = np.array([(env.terminated, env.truncated) for env in envs]).T
-        return s2, np.array(r), terminated, truncated, [env.info() for env in envs]
+        r = np.array([env.advance(a) for env, a in zip(envs, actions, strict=True)])  # (F,)
+        s2 = np.empty((len(envs), STACK, PIXELS, PIXELS), np.uint8)  # (F, 4, 84, 84)
+        s2[:, -1] = look(envs)
+        for env, stack in zip(envs, s2, strict=True):
+            stack[:-1] = env.observation[1:]
+            env.observation = stack
+        terminated = np.array([env.terminated for env in envs])  # (F,)
+        truncated = np.array([env.truncated for env in envs])  # (F,)
+        return s2, r, terminated, truncated, [env.info() for env in envs]
 
     def record(self, steps: int) -> list[list[tuple[int, str]]]:
         """For checkpoints: for every lane, seed and actions of the flights of its last steps."""

@@ -109,7 +109,7 @@ def raycast(
     cos, sin, rays = np.cos(bearings), np.sin(bearings), len(bearings)
     along = trunks @ np.array([cos, sin])  # (N, M) m: x * cos + y * sin
     across = trunks @ np.array([-sin, cos])  # (N, M) m: y * cos - x * sin
-    meet = np.flatnonzero(np.abs(across) < radius)  # (H,) pairs of a trunk and a ray
+    meet = np.flatnonzero(np.abs(across) < radius)  # (H,) trunk * M + ray, of pairs that meet
     half_chord = np.sqrt(radius**2 - across.ravel()[meet] ** 2)  # (H,) m
     distance = along.ravel()[meet] - half_chord  # (H,) m, negative: the trunk is behind the eye
     order = np.argsort(-distance)  # (H,) far to near: the nearest is written last, and stays
@@ -169,20 +169,25 @@ def camera(
     bark = scene.trunk_grazing + (scene.trunk_facing - scene.trunk_grazing) * facing  # (E * 84,)
     trunk = silhouette(distance, scene.trunk_height, scene)  # (84, E * 84)
     grey = fade(bark, distance, scene).astype(np.uint8)  # (E * 84,)
-    behind = backdrop(scene)  # (84, 1)
-    # np.where(trunk, grey, behind), but quicker. In uint8 35 - 60 is 231, and 60 + 231 is 35 again.
-    frames = behind + trunk * (grey - behind)  # (84, E * 84)
+    frames = trunk * grey + ~trunk * backdrop(scene)  # (84, E * 84) uint8
     if beacon is not None:
-        goal = (np.subtract(beacon, at)[:, None] @ turn)[:, 0]  # (E, 2) m, ahead and left
-        least = scene.beacon_pixels / 2 / FOCAL * goal[:, 0]  # (E,) m, the least radius to draw
-        scale = np.maximum(scene.beacon_radius, least) / scene.trunk_radius  # (E,)
-        # raycast knows one radius. A pole half as wide and half as far away looks the same.
-        near_goal = goal / scale[:, None]  # (E, 2) m
-        to_pole, _ = raycast(near_goal, scene.trunk_radius, BEARINGS, np.arange(eyes), eyes)
-        to_pole *= np.repeat(scale, PIXELS)  # (E * 84,) m
+        to_pole = pole_distance((np.subtract(beacon, at)[:, None] @ turn)[:, 0], scene)  # (E * 84,)
         pole = silhouette(to_pole, scene.beacon_height, scene)  # (84, E * 84)
         frames[pole & ~(trunk & (distance < to_pole))] = scene.beacon_grey
     return np.ascontiguousarray(frames.reshape(PIXELS, eyes, PIXELS).swapaxes(0, 1))
+
+
+def pole_distance(goal: ndarray, scene: Scene) -> ndarray:
+    """How far away every column's ray meets the goal's pole: (E * 84,) m, inf where it does not.
+
+    goal (E, 2): how far ahead and to the left of each eye the pole stands, m. raycast takes one
+    radius for all. So a pole that is twice as wide is cast at half its distance.
+    """
+    least = scene.beacon_pixels / 2 / FOCAL * goal[:, 0]  # (E,) m, the least radius to draw
+    scale = np.maximum(scene.beacon_radius, least) / scene.trunk_radius  # (E,)
+    near, eye = goal / scale[:, None], np.arange(len(goal))  # (E, 2) m, (E,)
+    distance, _ = raycast(near, scene.trunk_radius, BEARINGS, eye, len(goal))  # (E * 84,) m
+    return distance * np.repeat(scale, PIXELS)
 
 
 # -------------------------------------------------- pictures for people: skip this at first
