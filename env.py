@@ -206,7 +206,8 @@ class ForestEnv:
         self.actions.append(int(action))
         yaw_rate = self.world.yaw_rate * (2 * int(action) / (self.world.actions - 1) - 1)  # rad/s
         heading = self.drone.angle + yaw_rate * self.world.dt  # rad: turn first, then fly
-        self.drone.velocity = pymunk.Vec2d.from_polar(self.world.speed, heading)
+        speed = self.world.speed  # m/s
+        self.drone.velocity = speed * math.cos(heading), speed * math.sin(heading)
         self.drone.angular_velocity = yaw_rate
         self.space.step(self.world.dt)  # pymunk moves the drone for dt seconds
         self._sense()

@@ -112,12 +112,12 @@ def raycast(
     meet = np.flatnonzero(np.abs(across) < radius)  # (H,) trunk * M + ray, of pairs that meet
     half_chord = np.sqrt(radius**2 - across.ravel()[meet] ** 2)  # (H,) m
     distance = along.ravel()[meet] - half_chord  # (H,) m, negative: the trunk is behind the eye
-    order = np.argsort(-distance)  # (H,) far to near: the nearest is written last, and stays
-    order = order[distance[order] > 0]
-    trunk, ray = meet[order] // rays, meet[order] % rays  # (H,), (H,)
+    trunk, ray = meet // rays, meet % rays  # (H,), (H,)
     place = ray if eye is None else eye[trunk] * rays + ray  # (H,) eye 1's rays follow eye 0's
     first, facing = np.full(eyes * rays, np.inf), np.zeros(eyes * rays)  # (E * M,), (E * M,)
-    first[place], facing[place] = distance[order], half_chord[order] / radius
+    np.minimum.at(first, place, np.where(distance > 0, distance, np.inf))  # each ray's least
+    nearest = distance == first[place]  # (H,) the hits that are their ray's first
+    facing[place[nearest]] = half_chord[nearest] / radius
     return first, facing
 
 
