@@ -81,7 +81,8 @@ mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, 
     values.gather(1, a[:, None])[:, 0]      in NumPy: values[arange(len(a)), a]
 
 A mark like [+double] means: not in the textbook. The name is the setting that switches it off. As
-textbook we count what [Mnih15] ran: line 14, but an error beyond 1 pulls like an error of 1.
+textbook we also count the limit that [Mnih15] sets to line 14: an error beyond 1 pulls like one
+of 1.
 
 Legend
     s, a      state and action
@@ -204,8 +205,9 @@ def td_target(r: Tensor, gamma_n: Tensor, end: Tensor, q2: Tensor, q2_online: Te
     which a2 is chosen. In the textbook these are q2 too.
 
     [+double] Let two actions both be worth 0 in truth. Q^ errs by +1 and -1, so its max is 1: too
-    high, always. Let Q choose a2 instead. Its errors are other ones, so half of the time it takes
-    the action that Q^ values at -1. On average the label is right.
+    high, always. Let Q choose a2 instead. It has been updated since Q^ was copied, so its errors
+    are partly others, and often it takes the action that Q^ values at -1. The label is too high
+    less often.
     """
     a2 = q2_online.argmax(1, keepdim=True)  # (B, 1)
     v2 = q2.gather(1, a2)[:, 0]  # (B,) the q2 of a2; if q2_online is q2, the max

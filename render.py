@@ -25,6 +25,7 @@ ground plane. A camera is 84 rays. A laser scanner is 360 rays. One formula serv
 
       half_chord = sqrt(radius^2 - across^2)      by Pythagoras, if abs(across) < radius
       distance   = along - half_chord             from the eye to the bark
+      facing     = half_chord / radius            the cosine of the angle at #: 1 head-on, 0 grazing
 
     One ray in numbers: a trunk of radius 0.5 m stands 10 m ahead and 0.3 m to the left. The ray
     that points straight ahead has along = 10 and across = 0.3, so half_chord = 0.4 and the bark is
@@ -100,8 +101,7 @@ def raycast(
     trunks (N, 2): centres relative to the eye that looks, m. radius: m. bearings (M,): rad, the
     same for every eye. eye (N,): which of several eyes looks at which trunk.
     Returns the rays of the first eye, then those of the next: distance (E * M,), m along the ray,
-    inf where it hits nothing, and facing (E * M,), the cosine of the angle between the ray and the
-    surface's normal: 1 head-on, 0 grazing.
+    inf where it hits nothing, and facing (E * M,), 0 where it hits nothing.
 
     >>> raycast(np.array([[5.0, 0.0]]), 0.5, np.array([0.0, 1.0]))
     (array([4.5, inf]), array([1., 0.]))
@@ -156,12 +156,14 @@ def camera(
     """
     eyes, at, heading = len(poses), poses[:, :2], poses[:, 2]
     cos, sin = np.cos(heading), np.sin(heading)  # (E,), (E,)
+    # Into each drone's own axes: (x, y) @ turn = (x cos + y sin, y cos - x sin) = (ahead, left).
     turn = np.array([[cos, -sin], [sin, cos]]).transpose(2, 0, 1)  # (E, 2, 2) x, y -> ahead, left
     body = [(forest - xy) @ to for forest, xy, to in zip(trunks, at, turn, strict=True)]
     eye = np.repeat(np.arange(eyes), [len(forest) for forest in trunks])  # (N,) who looks at it
     body = np.concatenate(body)  # (N, 2) m, every trunk in the axes of the drone that looks at it
     ahead, left = body.T  # (N,), (N,) m
-    # Only what may be in the picture: ahead, in view, and between its two edges at 45 degrees.
+    # Keep what may be in the picture: ahead, in view, and between its two edges at 45 degrees, with
+    # two radii to spare because a trunk is wide.
     near = (ahead > 0) & (ahead < scene.view) & (np.abs(left) < ahead + 2 * scene.trunk_radius)
     distance, facing = raycast(
         body[near], scene.trunk_radius, BEARINGS, eye[near], eyes
@@ -169,7 +171,7 @@ def camera(
     bark = scene.trunk_grazing + (scene.trunk_facing - scene.trunk_grazing) * facing  # (E * 84,)
     trunk = silhouette(distance, scene.trunk_height, scene)  # (84, E * 84)
     grey = fade(bark, distance, scene).astype(np.uint8)  # (E * 84,)
-    frames = trunk * grey + ~trunk * backdrop(scene)  # (84, E * 84) uint8
+    frames = trunk * grey + ~trunk * backdrop(scene)  # (84, E * 84) uint8: bark, or what is behind
     if beacon is not None:
         to_pole = pole_distance((np.subtract(beacon, at)[:, None] @ turn)[:, 0], scene)  # (E * 84,)
         pole = silhouette(to_pole, scene.beacon_height, scene)  # (84, E * 84)
@@ -180,8 +182,9 @@ def camera(
 def pole_distance(goal: ndarray, scene: Scene) -> ndarray:
     """How far away every column's ray meets the goal's pole: (E * 84,) m, inf where it does not.
 
-    goal (E, 2): how far ahead and to the left of each eye the pole stands, m. raycast takes one
-    radius for all. So a pole that is twice as wide is cast at half its distance.
+    goal (E, 2): how far ahead and to the left of each eye the pole stands, m. raycast knows one
+    radius only. A picture stays the same if all is made smaller by the same factor. So divide the
+    pole's distance by what makes its radius a trunk's, cast, and multiply back.
     """
     least = scene.beacon_pixels / 2 / FOCAL * goal[:, 0]  # (E,) m, the least radius to draw
     scale = np.maximum(scene.beacon_radius, least) / scene.trunk_radius  # (E,)
