@@ -105,15 +105,15 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
     that flies on.
     Why goal_value: arrival ends the flight, and with it all rewards. A drone that circled at the
     goal for ever would earn 1.25 + 0.99 * 1.25 + 0.99^2 * 1.25 + ... = 1.25 / (1 - 0.99) = 125.
-    If arrival paid less, circling would be better. A label is r + gamma * the value of what
-    follows. Nothing follows an end, so we supply that value: gamma * 125.
+    If arrival paid less, circling would be better. So the last reward gets gamma * 125 more, as if
+    the drone lived on after its arrival.
     Why far_value: no picture shows which edge is the far one. Leaving by any other edge costs 10,
     and so does this one in the paper's reward. It must pay so much that the risk is worth it; 200
     was found by trial. It is more than 125, so this pilot crosses often and seldom arrives.
 
     The field calls this reward shaping. A policy is a rule that picks the action in every state.
-    Shaping of one kind provably leaves the best policy as it is: to pay gamma * h(s2) - h(s), for
-    some score h of the states [Ng 1999]. Ours is not of that kind, and is meant to change the
+    There is a kind that leaves the best policy as it is, because its payments cancel along a flight
+    (potential-based shaping [Ng 1999]). Ours is not of that kind, and is meant to change the
     policy. Only the network sees it. Every reward that is printed or logged is the paper's.
     """
     forward = np.array([info["forward"] for info in infos])  # (L,) m
@@ -162,9 +162,9 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
         # [+lr_decay] The learning rate: large strides at first, small ones to settle.
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)
         agent.optimizer.param_groups[0]["lr"] = lr
-        # [+huber] The loss of an error e is e^2 / (2 delta) up to delta, |e| - delta / 2 beyond. If
-        # delta is 1, an error of 50 pulls like one of 1: steady, good to begin with. If it is 100,
-        # an error of 50 pulls like fifty errors of 1: rare crashes count in full.
+        # [+huber] The loss of an error e is e^2 / (2 delta) up to delta, |e| - delta / 2 beyond, so
+        # it pulls by e / delta, at most 1. If delta is 1, errors of 1 and 50 pull alike: steady. If
+        # it is 100, the 50 pulls 50 times as hard as the 1: a rare crash counts.
         delta = c.huber if step > c.huber_after else 1.0
 
         fleet.reset(fleet.landed, rng.integers(TRAIN_END, size=len(fleet.landed)))  # 4, 5

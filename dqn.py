@@ -19,7 +19,7 @@ with a label: the number that should have come out. Nobody has the labels. But t
 r plus gamma times the return from s2, and the drone that takes the best action in s2 may expect the
 greatest Q of s2. So every transition makes a label y for Q(s, a):
 
-    y = r + gamma * max over a2 of Q(s2, a2)        at the end of a flight: y = r
+    y = r + gamma * max over a2 of Q(s2, a2)        where a crash or such ends the flight: y = r
 
 In numbers: r = 0.5, and the greatest of the nine values Q(s2, .) is 10. Then y = 0.5 + 0.99 * 10 =
 10.4. If Q(s, a) is 8, its error is 2.4. A gradient step changes every weight a little, in the
@@ -76,8 +76,8 @@ mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, 
     q(s)               calls QNetwork.forward; a tensor is an array that remembers how it was made
     torch.no_grad()    do not remember; so a label is a constant, and only Q(s, a) is moved
     optimizer.zero_grad()   forget the last gradient
-    loss.backward()    compute the gradient
-    optimizer.step()   move every weight a little against it; the learning rate says how far
+    loss.backward()    compute the gradient, and leave it with the weights
+    optimizer.step()   move its weights a little against it; the learning rate says how far
     values.gather(1, a[:, None])[:, 0]      in NumPy: values[arange(len(a)), a]
 
 A mark like [+double] means: not in the textbook. The name is the setting that switches it off. As
@@ -206,8 +206,8 @@ def td_target(r: Tensor, gamma_n: Tensor, end: Tensor, q2: Tensor, q2_online: Te
 
     [+double] Let two actions both be worth 0 in truth. Q^ errs by +1 and -1, so its max is 1: too
     high, always. Let Q choose a2 instead. It has been updated since Q^ was copied, so its errors
-    are partly others, and often it takes the action that Q^ values at -1. The label is too high
-    less often.
+    differ. It may prefer the action that Q^ undervalues; then the label is -1, and not 1. So the
+    errors partly cancel.
     """
     a2 = q2_online.argmax(1, keepdim=True)  # (B, 1)
     v2 = q2.gather(1, a2)[:, 0]  # (B,) the q2 of a2; if q2_online is q2, the max
@@ -241,9 +241,9 @@ class Replay:
     drawn. To keep s and s2 whole would cost eight times as much. Row t, lane l holds the newest
     picture of s_t of drone l, the action taken there, its reward and how it ended.
 
-        lane 0   x x x|x x x x x x x x           | a flight's end: no stack and no
-        lane 1   x x x x x x x|x x x x             n-step window reaches across it,
-                             ^ write position      nor across the write position
+        lane 0   x x x|x x x x x x x x     |  a flight's end: no stack and no n-step
+        lane 1   x x x x x|x x x x x x        window reaches across it,
+                           W               W  nor across the row that is written next
 
     The s2 of a transition is the state of the next row. After a crash no s2 is needed. After the
     time limit it is needed and no row holds it, so `last_frames` keeps its newest picture. An
@@ -296,10 +296,11 @@ class Replay:
         [+n_steps] With n = 2 the label of Q(s_0, a_0) is r_0 + gamma * r_1 + gamma^2 * max Q^(s_2,
         .): two true rewards, then the estimate. So the truth moves n states backwards with each
         update, and not one. The price: r_1 followed from the action that was taken in s_1. If that
-        was not the best one, the label is too low. A window stops at the end of a flight.
+        was not the best one, the label is too low. We accept that, because it learns sooner. A
+        window stops at the end of a flight.
         """
         # last: the row of the newest reward in r. power: gamma^k for the reward k steps on.
-        last, r, power = row, self.rewards[row, lane], np.ones(len(row), np.float32)  # (B,)
+        last, r, power = row, self.rewards[row, lane], np.ones(len(row), np.float32)  # (B,) each
         for _ in range(n - 1):
             live = self.ends[last, lane] == LIVE  # (B,) the flight goes on: take one more step
             last = np.where(live, (last + 1) % self.rows, last)  # (B,)

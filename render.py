@@ -115,7 +115,7 @@ def raycast(
     trunk, ray = meet // rays, meet % rays  # (H,), (H,)
     place = ray if eye is None else eye[trunk] * rays + ray  # (H,) eye 1's rays follow eye 0's
     first, facing = np.full(eyes * rays, np.inf), np.zeros(eyes * rays)  # (E * M,), (E * M,)
-    np.minimum.at(first, place, np.where(distance > 0, distance, np.inf))  # each ray's least
+    np.minimum.at(first, place, np.where(distance > 0, distance, np.inf))  # .at: places may repeat
     nearest = distance == first[place]  # (H,) the hits that are their ray's first
     facing[place[nearest]] = half_chord[nearest] / radius
     return first, facing
@@ -183,8 +183,8 @@ def pole_distance(goal: ndarray, scene: Scene) -> ndarray:
     """How far away every column's ray meets the goal's pole: (E * 84,) m, inf where it does not.
 
     goal (E, 2): how far ahead and to the left of each eye the pole stands, m. raycast knows one
-    radius only. A picture stays the same if all is made smaller by the same factor. So divide the
-    pole's distance by what makes its radius a trunk's, cast, and multiply back.
+    radius only. But a pole that is twice as thick and twice as far away looks the same. So: scale =
+    pole's radius / trunk's radius; cast at the distance / scale; multiply back.
     """
     least = scene.beacon_pixels / 2 / FOCAL * goal[:, 0]  # (E,) m, the least radius to draw
     scale = np.maximum(scene.beacon_radius, least) / scene.trunk_radius  # (E,)
