@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import ClassVar
 
@@ -357,9 +358,9 @@ def test_a_malicious_checkpoint_runs_nothing(
 def test_interrupted_at_ten_random_moments_is_uninterrupted(
     uninterrupted: Path, tmp_path: Path
 ) -> None:
-    rng, steps = np.random.default_rng(), []
+    rng, steps, names = np.random.default_rng(), [], (f"cut{i}" for i in count())
     while len(steps) < 10 or sum(step > SMALL["replay_size"] for step in steps) < 2:
-        name = f"cut{len(steps)}"
+        name = next(names)
         process = start("train", *FLAGS, "--name", name, folder=tmp_path)
         flies(process)
         try:
@@ -367,10 +368,12 @@ def test_interrupted_at_ten_random_moments_is_uninterrupted(
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGINT)
         process.communicate()
-        if process.returncode == 0:
+        step = load(tmp_path / "runs" / name / CHECKPOINT, "checkpoint")["book"]["step"]
+        if step == SMALL["steps"]:
             continue  # it was done already
-        steps.append(load(tmp_path / "runs" / name / CHECKPOINT, "checkpoint")["book"]["step"])
-        assert finish("train", "--resume", f"runs/{name}", folder=tmp_path)[0] == 0
+        steps.append(step)
+        code, _, error = finish("train", "--resume", f"runs/{name}", folder=tmp_path)
+        assert code == 0, error
         assert_same_training(uninterrupted, tmp_path / "runs" / name)
     print(f"interrupted at steps {sorted(steps)}")
 
