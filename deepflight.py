@@ -75,7 +75,8 @@ class RunConfig:
 
 
 SETTINGS = (*fields(DQNConfig), *fields(RunConfig))
-# With the beacon the goal can be seen, so no other way out should be worth as much.
+# With the beacon the goal can be seen. So no other way out should be worth as much, and
+# flying ahead is not the aim: a pilot that is paid for it passes the goal.
 BEACON = {"forward_reward": 0.0, "far_value": 50.0}
 # [Mnih15, Extended Data Table 1], as the paper says [DF §II-B]. 1.4 M steps are the paper's own.
 # Eight drones still fly side by side.
@@ -162,9 +163,9 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
         # [+lr_decay] The learning rate: large strides at first, small ones to settle.
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)
         agent.optimizer.param_groups[0]["lr"] = lr
-        # [+huber] The loss of an error e is e^2 / (2 delta) up to delta, |e| - delta / 2 beyond, so
-        # it pulls by e / delta, at most 1. If delta is 1, errors of 1 and 50 pull alike: steady. If
-        # it is 100, the 50 pulls 50 times as hard as the 1: a rare crash counts.
+        # [+huber] The loss of an error e is e^2 / (2 delta) up to delta, |e| - delta / 2 beyond. If
+        # delta is 1, errors of 1 and 50 have slopes 1 and 1: steady. If it is 100, 0.01 and 0.5: a
+        # rare crash counts 50 times. (That all slopes are smaller, Adam makes up for.)
         delta = c.huber if step > c.huber_after else 1.0
 
         fleet.reset(fleet.landed, rng.integers(TRAIN_END, size=len(fleet.landed)))  # 4, 5

@@ -73,7 +73,8 @@ four pictures that we call s, and theta are the weights.
 
 PyTorch in six lines. The loss is one number that says how wrong a batch of outputs is, such as the
 mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, and how fast.
-    q(s)               calls QNetwork.forward; a tensor is an array that remembers how it was made
+    q(s)               calls QNetwork.forward; a tensor is an array that remembers how it was made,
+                       so that the chain rule can lead back to every weight
     torch.no_grad()    do not remember; so a label is a constant, and only Q(s, a) is moved
     optimizer.zero_grad()   forget the last gradient
     loss.backward()    compute the gradient, and leave it with the weights
@@ -81,8 +82,8 @@ mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, 
     values.gather(1, a[:, None])[:, 0]      in NumPy: values[arange(len(a)), a]
 
 A mark like [+double] means: not in the textbook. The name is the setting that switches it off. As
-textbook we also count the limit that [Mnih15] sets to line 14: an error beyond 1 pulls like one
-of 1.
+textbook we also count a limit of [Mnih15] to line 14: the loss grows in a straight line beyond an
+error of 1, so that large errors do not pull harder than that.
 
 Legend
     s, a      state and action
@@ -204,10 +205,10 @@ def td_target(r: Tensor, gamma_n: Tensor, end: Tensor, q2: Tensor, q2_online: Te
     world. q2 (B, A): Q^(s2, .), which says what an action is worth. q2_online (B, A): the values by
     which a2 is chosen. In the textbook these are q2 too.
 
-    [+double] Let two actions both be worth 0 in truth. Q^ errs by +1 and -1, so its max is 1: too
-    high, always. Let Q choose a2 instead. It has been updated since Q^ was copied, so its errors
-    differ. It may prefer the action that Q^ undervalues; then the label is -1, and not 1. So the
-    errors partly cancel.
+    [+double] Let two actions both be worth 0 in truth, and let Q^ err by +1 and -1. A max picks
+    whatever error points upwards: it is 1, too high. Let Q choose a2 instead. If its errors had
+    nothing to do with those of Q^, it would hit +1 and -1 equally often: 0 on average, which is
+    right. (They have something to do with each other, so it helps in part.)
     """
     a2 = q2_online.argmax(1, keepdim=True)  # (B, 1)
     v2 = q2.gather(1, a2)[:, 0]  # (B,) the q2 of a2; if q2_online is q2, the max
@@ -241,9 +242,9 @@ class Replay:
     drawn. To keep s and s2 whole would cost eight times as much. Row t, lane l holds the newest
     picture of s_t of drone l, the action taken there, its reward and how it ended.
 
-        lane 0   x x x|x x x x x x x x     |  a flight's end: no stack and no n-step
-        lane 1   x x x x x|x x x x x x        window reaches across it,
-                           W               W  nor across the row that is written next
+        lane 0   x x x|x x x x x x x x     |: a flight's end, which no stack and no n-step
+        lane 1   x x x x x|x x x x x x        window crosses
+                           W               W: the row written next, which no window crosses
 
     The s2 of a transition is the state of the next row. After a crash no s2 is needed. After the
     time limit it is needed and no row holds it, so `last_frames` keeps its newest picture. An
@@ -299,7 +300,8 @@ class Replay:
         was not the best one, the label is too low. We accept that, because it learns sooner. A
         window stops at the end of a flight.
         """
-        # last: the row of the newest reward in r. power: gamma^k for the reward k steps on.
+        # last: the row of the newest reward in r. power: gamma^k for the reward k steps on. In the
+        # example, row 1, n = 3: pass 1 gives last 2, power 0.99, r = 1 - 9.9; pass 2 adds nothing.
         last, r, power = row, self.rewards[row, lane], np.ones(len(row), np.float32)  # (B,) each
         for _ in range(n - 1):
             live = self.ends[last, lane] == LIVE  # (B,) the flight goes on: take one more step

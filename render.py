@@ -140,7 +140,8 @@ def silhouette(distance: ndarray, height: float, scene: Scene) -> ndarray:
     """Pixels (84, E * 84) bool that walls of this height cover, at distance (E * 84,) m."""
     depth = (distance.reshape(-1, PIXELS) * COSINES).ravel()  # (E * 84,) m
     above = np.array([[height - scene.altitude], [-scene.altitude]])  # (2, 1) m, top and foot
-    rows = np.ceil(CENTRE - FOCAL * above / depth)  # (2, E * 84) inf: both 42, so nothing between
+    # A ray that hits nothing has depth inf. Top and foot are then both 42, and nothing is between.
+    rows = np.ceil(CENTRE - FOCAL * above / depth)  # (2, E * 84)
     top, end = np.minimum(np.maximum(rows, 0), PIXELS).astype(np.uint8)  # (E * 84,) each
     return (top <= ROWS) & (end > ROWS)
 
@@ -156,7 +157,8 @@ def camera(
     """
     eyes, at, heading = len(poses), poses[:, :2], poses[:, 2]
     cos, sin = np.cos(heading), np.sin(heading)  # (E,), (E,)
-    # Into each drone's own axes: (x, y) @ turn = (x cos + y sin, y cos - x sin) = (ahead, left).
+    # One matrix per drone, into its own axes: (x, y) @ turn = (x cos + y sin, y cos - x sin), which
+    # is (ahead, left).
     turn = np.array([[cos, -sin], [sin, cos]]).transpose(2, 0, 1)  # (E, 2, 2) x, y -> ahead, left
     body = [(forest - xy) @ to for forest, xy, to in zip(trunks, at, turn, strict=True)]
     eye = np.repeat(np.arange(eyes), [len(forest) for forest in trunks])  # (N,) who looks at it
