@@ -31,7 +31,8 @@ Legend
     F  flights
     The other symbols are those of dqn.py.
 
-Not in this file: anything about pictures (render.py), flying (env.py) or networks (dqn.py).
+Not in this file: how pictures are drawn (render.py), drones fly (env.py) or networks learn (dqn.py
+has the parts, and `train` puts them together).
 """
 
 import argparse

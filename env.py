@@ -82,7 +82,7 @@ class World(Scene):
     """The forest, the drone and the rules, in SI units. `Scene` adds what they look like."""
 
     length: float = 90.0  # m, x of the goal edge; d_max of the reward [DF §II-A]
-    width: float = 50.0  # m, authors' simulator, as all of the next nine
+    width: float = 50.0  # m; this and all down to jitter_y: authors' simulator
     back: float = 2.0  # m, how far the drone may retreat behind the start edge
     rows: int = 15  # trunks along x
     columns: int = 10  # trunks along y
