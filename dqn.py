@@ -143,7 +143,7 @@ class DQNConfig:
     epsilon_final: float = setting(0.05, "share of random actions in the end; it starts at 1", 0, 1)
     epsilon_decay: int = setting(40_000, "control steps until epsilon is at its final value", 1)
     lr: float = setting(2.5e-4, "learning rate [Mnih15]", 0, 1)
-    adam: bool = setting(True, "[+] Adam; --no-adam: RMSprop", 0, 1)
+    adam: bool = setting(True, "[+] Adam; --no-adam: Mnih's RMSprop", 0, 1)
     num_envs: int = setting(8, "[+] drones that fly side by side; 1: off", 1, 1000)
     double: bool = setting(True, "[+] Double DQN [van Hasselt 2016]; --no-double: off", 0, 1)
     n_steps: int = setting(5, "[+] true rewards in a label; 1: off", 1, 100)
@@ -350,12 +350,35 @@ class Agent(nn.Module):
         self.updates = state["updates"]
 
 
+class RMSprop(torch.optim.Optimizer):
+    """[Mnih15]'s optimizer. A weight's gradient g moves it by -lr * g / sqrt(variance + epsilon).
+
+    The variance is the running mean of g^2, less the square of the running mean of g. Both of the
+    paper's 0.95 are decay factors of these means, so nothing here is a velocity, and PyTorch's own
+    RMSprop with momentum is another algorithm. The paper's epsilon is 0.01 for a gradient that is
+    the sum over a batch of 32. Ours is the mean, so the epsilon is 0.01 / 32^2.
+    """
+
+    def __init__(self, theta: Any, lr: float) -> None:
+        super().__init__(theta, {"lr": lr})
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Move every weight once."""
+        for w in self.param_groups[0]["params"]:
+            if not self.state[w]:
+                self.state[w] = {"mean": torch.zeros_like(w), "mean_square": torch.zeros_like(w)}
+            mean, mean_square = self.state[w].values()
+            mean.lerp_(w.grad, 0.05)
+            mean_square.lerp_(w.grad**2, 0.05)
+            deviation = (mean_square - mean**2 + 0.01 / 32**2).sqrt()
+            w.addcdiv_(w.grad, deviation, value=-self.param_groups[0]["lr"])
+
+
 def make_optimizer(theta: Any, c: DQNConfig) -> torch.optim.Optimizer:
-    """[+adam] Adam gives each weight a stride of its own and needs little tuning. Without it: an
-    RMSprop after [Mnih15]. theta: the weights."""
-    if c.adam:
-        return torch.optim.Adam(theta, c.lr, eps=1.5e-4, fused=True)
-    return torch.optim.RMSprop(theta, c.lr, alpha=0.95, eps=0.01, momentum=0.95, centered=True)
+    """[+adam] Adam gives each weight a stride of its own and needs little tuning. Without it: the
+    RMSprop of [Mnih15]. theta: the weights."""
+    return torch.optim.Adam(theta, c.lr, eps=1.5e-4, fused=True) if c.adam else RMSprop(theta, c.lr)
 
 
 # -------------------------------------------------- what is not in the textbook

@@ -27,6 +27,7 @@ from dqn import (
     DQNConfig,
     QNetwork,
     Replay,
+    RMSprop,
     greedy,
     linear_schedule,
     load,
@@ -278,6 +279,27 @@ def test_bfloat16_moves_values_by_a_twentieth_of_their_spread_at_most() -> None:
         exact, fast = q(s), q(s, bfloat16=True)
     assert fast.dtype == torch.float32
     assert (fast - exact).abs().mean() < 0.05 * exact.std()
+
+
+def test_three_updates_of_mnihs_rmsprop_by_hand() -> None:
+    w = torch.zeros(1, requires_grad=True)
+    optimizer, places = RMSprop([w], lr=0.1), []
+    for g in (2.0, -1.0, 3.0):
+        w.grad = torch.tensor([g])
+        optimizer.step()
+        places.append(w.item())
+    # running means of g: 0.1, 0.045, 0.19275, and of g^2: 0.2, 0.24, 0.678
+    variances = 0.2 - 0.1**2, 0.24 - 0.045**2, 0.678 - 0.19275**2
+    steps = [-0.1 * g / v**0.5 for g, v in zip((2, -1, 3), variances, strict=True)]
+    assert places == pytest.approx(np.cumsum(steps).tolist(), rel=1e-4)
+
+
+def test_mnihs_epsilon_stands_inside_the_root_and_belongs_to_a_sum_of_32() -> None:
+    w = torch.zeros(1, requires_grad=True)
+    w.grad = torch.tensor([1e-5])  # so small that its variance counts for nothing
+    RMSprop([w], lr=1.0).step()
+    of_the_sum = 32 * 1e-5 / 0.01**0.5
+    assert w.item() == pytest.approx(-of_the_sum, rel=1e-3)
 
 
 def test_an_agent_begins_with_equal_networks_and_no_mean() -> None:
