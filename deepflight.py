@@ -120,8 +120,8 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
     policy. Only the network sees it. Every reward that is printed or logged is the paper's.
     """
     forward = np.array([info["forward"] for info in infos])  # (L,) m
-    arrived = np.array([info.get("outcome") == "goal" for info in infos])  # (L,)
-    far = np.array([info.get("edge") == "far" for info in infos])  # (L,)
+    arrived = np.array([info["outcome"] == "goal" for info in infos])  # (L,)
+    far = np.array([info["edge"] == "far" for info in infos])  # (L,)
     # [+forward_reward] [+goal_value] [+far_value]
     return r + rc.forward_reward * forward + gamma * (rc.goal_value * arrived + rc.far_value * far)
 

@@ -61,10 +61,12 @@ environment (the usual interface in this field) and does not need gymnasium.
 """
 
 import math
+import operator
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -132,12 +134,11 @@ def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
 
 
 def plant(seed: int, world: World) -> ndarray:
-    """Trunk centres (N, 2) in m: a jittered grid, a function of the seed alone."""
-    if not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"seed is {seed!r}, allowed are integers from 0")
+    """Trunk centres (N, 2) in m: a jittered grid, a function of the seed alone. Raises ValueError
+    if the seed is no whole number from 0."""
+    rng = np.random.default_rng(whole_number("seed", seed))
     centres = grid(world)  # (N, 2)
-    jitter = (world.jitter_x, world.jitter_y)
-    return centres + np.random.default_rng(seed).uniform(-1, 1, centres.shape) * jitter
+    return centres + rng.uniform(-1, 1, centres.shape) * (world.jitter_x, world.jitter_y)
 
 
 @cache
@@ -151,7 +152,8 @@ def grid(world: World) -> ndarray:
 class ForestEnv:
     """One drone, one forest, a new one every flight; Gymnasium 1.x signatures.
 
-    Observation: (4, 84, 84) uint8, oldest picture first, the first one repeated at reset.
+    Observation: (4, 84, 84) uint8, oldest picture first, the first one repeated at reset. It is the
+    caller's own: to write into it changes no other.
     Action: an int, 0 turns right at 0.7 rad/s, 4 flies straight, 8 turns left.
     `camera=False` leaves the pictures black, for pilots that look at nothing or at the laser.
     """
@@ -169,26 +171,29 @@ class ForestEnv:
     def reset(self, *, seed: int | None = None, options: object = None) -> tuple[ndarray, dict]:
         """Plant forest number `seed`, or the one after the last, and stand at the start.
 
-        Uses no random generator: the forest is a function of the seed. `options` is unused.
+        Uses no random generator: the forest is a function of the seed. `options` is unused. Raises
+        ValueError if the seed is no whole number from 0. Then no flight is in the air.
         """
         self.place(self.seed + 1 if seed is None else seed)
         self.observation = np.repeat(look([self]), STACK, 0)  # (4, 84, 84)
-        return self.observation, self.info()
+        return self.observation.copy(), self.info()
 
     def step(self, action: int) -> tuple[ndarray, float, bool, bool, dict]:
         """Turn at the action's yaw rate, fly one control step, look.
 
-        Returns observation, reward, terminated, truncated, info. info holds d_obs, d_goal and
-        forward (x gained in this step) in m, the pose (x, y, heading), and at the end the outcome,
-        the edge that the drone left by, and the progress.
+        Returns observation, reward, terminated, truncated, info. info holds d_obs, d_goal, forward
+        (x gained in this step) and progress in m, the pose (x, y, heading), the outcome ("" while
+        in the air) and the edge that the drone left by. Raises ValueError if no flight is in the
+        air, or if the action is no whole number from 0 to 8, of whatever integer type.
         """
         r = self.advance(action)
         self.observation = np.concatenate([self.observation[1:], look([self])])  # (4, 84, 84)
-        return self.observation, r, self.terminated, self.truncated, self.info()
+        return self.observation.copy(), r, self.terminated, self.truncated, self.info()
 
     def place(self, seed: int) -> None:
         """All of a reset but the looking."""
-        self.trunks, self.seed = plant(seed, self.world), seed  # (N, 2)
+        self.outcome = "not reset"  # a reset that fails leaves no flight in the air
+        self.trunks, self.seed = plant(seed, self.world), int(seed)  # (N, 2)
         for circle, centre in zip(self.bark, self.trunks.tolist(), strict=True):
             circle.unsafe_set_offset(centre)  # moves a trunk, ten times as fast as a new one
         self.space.reindex_static()  # tells pymunk that they moved
@@ -201,10 +206,9 @@ class ForestEnv:
         """All of a step but the looking: turn, fly, sense, judge. Returns the reward."""
         if self.outcome:
             raise ValueError(f"step needs a flight in the air, this one is {self.outcome}: reset")
-        if not isinstance(action, int | np.integer) or not 0 <= action < self.world.actions:
-            raise ValueError(f"action is {action!r}, allowed are 0 to {self.world.actions - 1}")
-        self.actions.append(int(action))
-        yaw_rate = self.world.yaw_rate * (2 * int(action) / (self.world.actions - 1) - 1)  # rad/s
+        action = whole_number("action", action, self.world.actions - 1)
+        self.actions.append(action)
+        yaw_rate = self.world.yaw_rate * (2 * action / (self.world.actions - 1) - 1)  # rad/s
         heading = self.drone.angle + yaw_rate * self.world.dt  # rad: turn first, then fly
         speed = self.world.speed  # m/s
         self.drone.velocity = speed * math.cos(heading), speed * math.sin(heading)
@@ -239,12 +243,10 @@ class ForestEnv:
         return "left" if self.edge else "time" if late else ""
 
     def info(self) -> dict[str, Any]:
-        """Where the drone is, and at the end what became of it."""
-        info: dict[str, Any] = {"d_obs": self.d_obs, "d_goal": self.d_goal, "pose": self.pose}
-        info["forward"] = self.forward
-        if self.outcome:
-            info |= {"outcome": self.outcome, "edge": self.edge, "progress": self.progress}
-        return info
+        """Where the drone is, and what has become of it."""
+        info = {"d_obs": self.d_obs, "d_goal": self.d_goal, "pose": self.pose}
+        info |= {"forward": self.forward, "progress": self.progress}
+        return info | {"outcome": self.outcome, "edge": self.edge}
 
     def flight(self) -> dict[str, Any]:
         """The flight so far: seed and actions, which are all of it, and what came of them."""
@@ -322,7 +324,7 @@ class Fleet:
         """Begin a flight in these lanes, through the forests of these seeds."""
         envs = [self.envs[lane] for lane in lanes]
         for lane, env, seed in zip(lanes, envs, seeds, strict=True):
-            env.place(int(seed))
+            env.place(seed)
             self.records[lane].append((env.seed, env.actions))  # the list grows as it flies
         for env, frame in zip(envs, look(envs) if envs else (), strict=True):
             env.observation = np.repeat(frame[None], STACK, 0)  # (4, 84, 84)
@@ -339,7 +341,7 @@ class Fleet:
         s2[:, -1] = look(envs)
         for env, stack in zip(envs, s2, strict=True):
             stack[:-1] = env.observation[1:]
-            env.observation = stack
+            env.observation = stack.copy()
         terminated = np.array([env.terminated for env in envs])  # (F,)
         truncated = np.array([env.truncated for env in envs])  # (F,)
         return s2, r, terminated, truncated, [env.info() for env in envs]
@@ -364,8 +366,9 @@ def random_pilot(rng: np.random.Generator) -> Pilot:
 
 
 def straight_pilot(fleet: Fleet) -> Sequence[int]:
-    """Dead ahead, whatever comes."""
-    return [env.world.actions // 2 for env in fleet.flying]
+    """Dead ahead, whatever comes. Of an even number of yaw rates none is straight: then it takes
+    the two in the middle in turn."""
+    return [(env.world.actions - 1 + len(env.actions) % 2) // 2 for env in fleet.flying]
 
 
 def laser_pilot(fleet: Fleet) -> Sequence[int]:
@@ -436,13 +439,31 @@ LIMITS |= dict.fromkeys(("sky", "ground", "trunk_facing", "trunk_grazing", "beac
 LIMITS |= {"rows": (0, 1e4), "columns": (0, 1e4), "beacon": (0, 1), "actions": (2, 10)}
 
 
+def whole_number(name: str, value: Any, high: float = math.inf) -> int:
+    """The value as an int, whatever its integer type; ValueError unless it is from 0 to high."""
+    try:
+        number = -1 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = -1
+    if not 0 <= number <= high:
+        end = f" to {high}" if high < math.inf else ""
+        raise ValueError(f"{name} is {value!r}, allowed are whole numbers from 0{end}")
+    return number
+
+
+# type -> what passes for it, in Python and in words
+KINDS = {bool: (bool, "true or false"), int: (Integral, "whole numbers"), float: (Real, "numbers")}
+
+
 def check_numbers(settings: Any, limits: dict[str, tuple[float, float]]) -> None:
     """Raise ValueError if a field of a dataclass is of another type or outside its limits."""
     for f in fields(settings):
         value, (low, high) = getattr(settings, f.name), limits.get(f.name, (1e-3, 1e4))
-        if not (isinstance(value, f.type | int) and low <= value <= high):
-            legal = f"{f.type.__name__} from {low:g} to {high:g}"
-            raise ValueError(f"{f.name} is {value}, allowed: {legal}")
+        kind, words = KINDS[f.type]
+        if (isinstance(value, bool) and kind is not bool) or not isinstance(value, kind):
+            raise ValueError(f"{f.name} is {value!r}, allowed are {words}")
+        if not low <= value <= high:
+            raise ValueError(f"{f.name} is {value}, allowed are {words} from {low:,g} to {high:,g}")
 
 
 def check_world(world: World) -> None:

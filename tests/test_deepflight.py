@@ -109,7 +109,7 @@ def test_where_the_beacon_shows_the_goal_nothing_else_is_worth_as_much() -> None
 
 
 def test_what_the_learner_is_paid_by_hand() -> None:
-    c, infos = RunConfig(), [{"forward": 0.5}, {"forward": -0.5}]
+    c, infos = RunConfig(), [{"forward": x, "outcome": "", "edge": ""} for x in (0.5, -0.5)]
     infos += [{"forward": 0.4, "outcome": end, "edge": ""} for end in ("goal", "crash", "time")]
     infos += [{"forward": 0.4, "outcome": "left", "edge": edge} for edge in ("far", "side", "back")]
     r = np.array([0.75, 0.75, 1.2, -10, 0.5, -10, -10, -10])

@@ -238,22 +238,60 @@ def test_without_a_seed_the_next_forest_is_the_next_number() -> None:
     assert env.seed == 42
 
 
-@pytest.mark.parametrize("action", [-1, 9, 0.5, 4.0, None, "4", [4], math.nan])
+@pytest.mark.parametrize("four", [np.array(4), np.int64(4), np.uint8(4)])
+def test_an_action_of_any_integer_type_means_what_the_int_means(four: object) -> None:
+    assert flown(ForestEnv(camera=False), [four])[1:] == flown(ForestEnv(camera=False), [4])[1:]
+
+
+def test_a_returned_observation_is_the_callers_own() -> None:
+    spoilt, whole = ForestEnv(), ForestEnv()
+    fleet = Fleet(WORLD, 1)
+    fleet.reset([0], [0])
+    for env, write in ((spoilt, True), (whole, False)):
+        seen = [env.reset(seed=0)[0]]
+        for a in (4, 5, 6):
+            if write:
+                seen[-1][:] = 7
+            seen.append(env.step(a)[0])
+    for a in (4, 5, 6):
+        fleet.observations[:] = 7
+        s2, *_ = fleet.step([a])
+        last = s2.copy()
+        s2[:] = 7
+    assert (seen[-1] == whole.observation).all()
+    assert (spoilt.observation == whole.observation).all()
+    assert (last[0] == whole.observation).all()
+
+
+def test_after_a_reset_that_fails_no_flight_is_in_the_air() -> None:
+    env = ForestEnv(camera=False)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="seed is -1"):
+        env.reset(seed=-1)
+    with pytest.raises(ValueError, match="reset"):
+        env.step(4)
+
+
+@pytest.mark.parametrize("action", [-1, 9, 0.5, 4.0, None, "4", [4], math.nan, True, np.True_])
 def test_an_impossible_action_is_named(action: object) -> None:
     env = ForestEnv(camera=False)
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="allowed are 0 to 8"):
+    with pytest.raises(ValueError, match="allowed are whole numbers from 0 to 8"):
         env.step(action)
 
 
-@pytest.mark.parametrize("seed", [-1, 0.5, "7", [1]])
+@pytest.mark.parametrize("seed", [-1, 0.5, "7", [1], True, 10**30 + 0.5])
 def test_an_impossible_seed_is_named(seed: object) -> None:
-    with pytest.raises(ValueError, match="allowed are integers from 0"):
+    with pytest.raises(ValueError, match="allowed are whole numbers from 0"):
         ForestEnv(camera=False).reset(seed=seed)
 
 
 def test_seeds_of_any_size_plant_a_forest() -> None:
     assert len(plant(10**30, WORLD)) == 150
+
+
+def test_a_world_takes_numpys_numbers() -> None:
+    assert World(rows=np.int64(10), speed=np.float32(4)) == World(rows=10, speed=4)
 
 
 def test_a_flight_that_is_over_or_not_begun_cannot_go_on() -> None:
@@ -290,6 +328,8 @@ def test_a_flight_that_is_over_or_not_begun_cannot_go_on() -> None:
         ({"speed": "fast"}, "speed"),
         ({"sky": 256}, "sky"),
         ({"max_steps": 0}, "max_steps"),
+        ({"rows": True}, "rows"),
+        ({"beacon": 1}, "beacon"),
     ],
 )
 def test_an_impossible_world_is_refused_by_the_name_of_what_is_wrong(
@@ -359,7 +399,7 @@ def test_a_fleet_needs_an_action_for_each_drone_in_the_air() -> None:
     fleet = Fleet(WORLD, 2, camera=False)
     fleet.reset([0, 1], [0, 1])
     for actions in ([4], [4, 4, 4], [4, 9]):
-        with pytest.raises(ValueError, match=r"zip|allowed are 0 to 8"):
+        with pytest.raises(ValueError, match=r"zip|allowed are whole numbers from 0 to 8"):
             fleet.step(actions)
 
 
@@ -399,6 +439,11 @@ def test_the_straight_pilot_flies_along_the_middle_line() -> None:
     (flight,) = fly(straight_pilot, [0], CLEARING, camera=False)
     assert (flight["outcome"], flight["steps"]) == ("goal", 175)  # within 3 m of x = 90 m
     assert flight["actions"] == "4" * 175
+
+
+def test_where_no_yaw_rate_is_straight_the_straight_pilot_takes_both_middle_ones_in_turn() -> None:
+    (flight,) = fly(straight_pilot, [0], replace(CLEARING, actions=4), camera=False)
+    assert (flight["outcome"], flight["actions"][:6]) == ("goal", "121212")
 
 
 def test_flights_come_in_the_order_of_their_seeds_and_as_each_flies_alone() -> None:
