@@ -12,13 +12,14 @@ film and plumbing (files, signals, clocks, the command line) stand last. Skip th
 
 `train` prints a row at every test point:
 
-     step   eps steps/s min left reward | test: reward over random crossed crash
-   10,000  0.76     354     13.7  -20.7           19.9        353%     17%    6%
+         step  eps    /s left reward |  test longer cross crash
+       10,000 0.76   354   14  -20.7 |  19.9   353%   17%    6%
 
-The drones have flown 10,000 control steps, and 76 % of the actions are random at this point. The
-last 100 training flights earned -20.7 each on average. Then the network flew through 48 test
-forests without random actions. It earned 19.9 per flight, stayed in the air 353 % longer than the
-random pilot, crossed the forest in 17 % of the flights, and crashed in 6 %.
+The drones have flown 10,000 control steps, and 76 % of the actions are random at this point. They
+fly 354 steps a second, and 14 minutes are left. The last 100 training flights earned a reward of
+-20.7 each on average. Then came the test: the network flew through 48 forests without random
+actions. It earned 19.9 per flight, stayed in the air 353 % longer than the random pilot, crossed
+the forest in 17 % of the flights, and crashed in 6 %.
 
 A seed is a forest. Training plants forests from [0, 10^9). Test points choose the weights to keep,
 and fly forests from [10^9, 2 * 10^9). `eval` starts at 2 * 10^9, so its forests neither shaped the
@@ -36,27 +37,34 @@ has the parts, and `train` puts them together).
 """
 
 import argparse
+import copy
 import json
 import math
+import os
+import re
 import shlex
+import shutil
 import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import Field, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, NoReturn
+
+if __name__ == "__main__":  # Ctrl-C while torch is loaded, which takes seconds: no traceback
+    CTRL_C = signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import numpy as np
 import torch
 from numpy import ndarray
-from numpy.random import Generator
 
 import dqn
 import env
 import render
 from dqn import Agent, DQNConfig, QNetwork, Replay, greedy, linear_schedule, mirror, td_target
-from env import OUTCOMES, Fleet, Flights, Pilot, World, fly, fly_random, measure, refly, show
+from env import OUTCOMES, Fleet, Flights, Pilot, World, fly, fly_random, measure, refly, say, show
 
 TRAIN_END, TEST_FIRST, EVAL_FIRST = 10**9, 10**9, 2 * 10**9  # forest seeds
 TESTS = range(TEST_FIRST, TEST_FIRST + 48)  # the forests of a test point
@@ -66,7 +74,7 @@ TESTS = range(TEST_FIRST, TEST_FIRST + 48)  # the forests of a test point
 class RunConfig:
     """The experiment's settings; dqn.py has those of the algorithm. Each is a flag of `train`."""
 
-    seed: int = dqn.setting(0, "of everything random", 0)
+    seed: int = dqn.setting(0, "of everything random", 0, 1e18)
     beacon: bool = dqn.setting(False, "put a visible pole at the goal", 0, 1)
     threads: int = dqn.setting(2, "of the CPU; other numbers give other last digits", 1, 256)
     test_every: int = dqn.setting(5_000, "control steps between test points, which also save", 1)
@@ -218,47 +226,51 @@ def dqn_pilot(q: QNetwork) -> Pilot:
 
 
 def evaluate(args: argparse.Namespace) -> int:
-    """Fly every pilot through the same forests; print the table, write pictures and JSON."""
-    q = load_pilot(args)
-    torch.set_num_threads(RunConfig.threads)
+    """Fly every pilot through the same forests; print the table, write JSON and a film."""
+    q, gif = load_pilot(args), args.out / "flight.gif"
     world, rng = World(beacon=args.beacon), np.random.default_rng(0)
     seeds = range(args.first_seed, args.first_seed + args.episodes)
     pilots = {"straight": env.straight_pilot, "laser": env.laser_pilot, "dqn": dqn_pilot(q)}
     bar = fly_random(seeds, world, rng)
     flights = {p: bar if p == "random" else fly(pilots[p], seeds, world) for p in args.pilots}
-    figures = {p: summarize(flights[p], bar, len(seeds), rng) for p in flights}
-    print(f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in brackets\n")
-    print_table(figures)
+    draws = rng.integers(len(seeds), size=(2000, len(seeds)))  # (2000, forests) resampled
+    figures = {p: summarize(flights[p], bar, draws) for p in flights}
     if args.json:
-        report = {"weights": str(args.weights), "beacon": args.beacon}
+        report = {"program": "Deep Flight", "weights": str(args.weights), "beacon": args.beacon}
         report |= {"first_seed": seeds[0], "forests": len(seeds)}
         report["pilots"] = {p: figures[p] | {"flights": flights[p]} for p in flights}
-        dqn.write_whole(args.json, json.dumps(report).encode())
+        with dqn.whole_file(args.json) as file:
+            file.write(json.dumps(report).encode())
+    many = f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in brackets\n"
+    say(many if len(seeds) > 1 else f"1 forest, of seed {seeds[0]}\n")
+    print_table(figures)
+    say(f"\nwrote {args.json}" if args.json else "")
     best = int(measure(flights[args.pilots[-1]])["crossed"].argmax())  # the first to cross, or 0
-    pictures = film({p: flights[p][best] for p in flights}, world, q)
-    render.save_film(args.out / "flight.gif", pictures, round(1000 * world.dt))
-    print(f"\nwrote {args.out / 'flight.gif'}: forest {seeds[best]}, pilot {args.pilots[-1]}")
+    with dqn.whole_file(gif) as file:
+        pictures = film({p: flights[p][best] for p in flights}, world, q)
+        render.save_film(file, pictures, round(1000 * world.dt))
+    say(f"wrote {gif}: forest {seeds[best]}, pilot {args.pilots[-1]}")
     return 0
 
 
 # -------------------------------------------------- statistics, film: skip on a first reading
 
 
-def summarize(flights: Flights, bar: Flights, forests: int, rng: Generator) -> dict[str, dict]:
-    """Every figure with its 95 % interval: value, low, high.
+def summarize(flights: Flights, bar: Flights, draws: ndarray) -> dict[str, dict]:
+    """Every figure with its 95 % interval: value, low, high; of one forest the value alone.
 
     Flights through the same forest resemble each other. So a mean is taken over forests, and its
     interval comes from the bootstrap: draw as many forests again, with replacement, 2,000 times,
-    and see how the mean varies. A share has Wilson's interval, right for one flight per forest.
+    and see how the mean varies. draws (2000, forests) says which. A share has Wilson's interval.
     """
-    table, random_steps = measure(flights), measure(bar)["steps"].reshape(-1, forests).mean(0)
-    draws = rng.integers(forests, size=(2000, forests))  # (2000, forests) resampled
-    means = {k: table[k].reshape(-1, forests).mean(0) for k in ("steps", "progress", "return")}
-    figures = {key: interval(x.mean(), x[draws].mean(1)) for key, x in means.items()}
-    ratios = means["steps"][draws].mean(1) / random_steps[draws].mean(1)
+    forests = draws.shape[1]
+    means = {key: x.reshape(-1, forests).mean(0) for key, x in measure(flights).items()}
+    random_steps = measure(bar)["steps"].reshape(-1, forests).mean(0)  # (forests,)
+    figures = {k: interval(means[k].mean(), means[k][draws].mean(1)) for k in MEANS}
+    ratios = means["steps"][draws].mean(1) / random_steps[draws].mean(1)  # (2000,)
     figures["over_random"] = interval(means["steps"].mean() / random_steps.mean() - 1, ratios - 1)
-    shares = {key: wilson(int(table[key].sum()), len(flights)) for key in ("crossed", *OUTCOMES)}
-    return figures | shares
+    figures |= {key: wilson(means[key].mean(), forests) for key in ("crossed", *OUTCOMES)}
+    return figures if forests > 1 else {k: {"value": x["value"]} for k, x in figures.items()}
 
 
 def interval(value: float, resampled: ndarray) -> dict[str, float]:
@@ -267,31 +279,34 @@ def interval(value: float, resampled: ndarray) -> dict[str, float]:
     return {"value": float(value), "low": float(low), "high": float(high)}
 
 
-def wilson(hits: int, n: int) -> dict[str, float]:
-    """A share and its 95 % interval by Wilson's score [Wilson 1927].
+def wilson(p: float, n: int) -> dict[str, float]:
+    """A share p of n, and its 95 % interval by Wilson's score [Wilson 1927].
 
-    >>> {key: round(x, 3) for key, x in wilson(10, 10).items()}
+    >>> {key: round(x, 3) for key, x in wilson(1.0, 10).items()}
     {'value': 1.0, 'low': 0.722, 'high': 1.0}
     """
-    z, p = 1.96, hits / n
+    z = 1.96
     middle = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return {"value": p, "low": max(middle - half, 0.0), "high": min(middle + half, 1.0)}
+    return {"value": float(p), "low": max(middle - half, 0.0), "high": min(middle + half, 1.0)}
 
 
-ROWS = {  # the table: figure -> label, factor, digits
-    "steps": ("steps", 1, 0), "over_random": ("vs random, %", 100, 0),
-    "crossed": ("crossed, %", 100, 0), "crash": ("crashed, %", 100, 0),
-    "goal": ("arrived, %", 100, 0), "return": ("total reward", 1, 0),
+MEANS = ("steps", "progress", "return")  # the other figures are shares
+ROWS = {  # the table: figure -> label, factor
+    "steps": ("steps", 1), "over_random": ("vs random, %", 100), "crossed": ("crossed, %", 100),
+    "crash": ("crashed, %", 100), "goal": ("arrived, %", 100), "return": ("total reward", 1),
 }  # fmt: skip
 
 
 def print_table(figures: dict[str, dict]) -> None:
-    """One row a figure, one column a pilot."""
-    print(f"{'':12}" + "".join(f"{name:>17}" for name in figures))
-    for key, (label, factor, digits) in ROWS.items():
-        cells = [[f"{factor * x:.{digits}f}" for x in p[key].values()] for p in figures.values()]
-        print(f"{label:12}" + "".join(f"{f'{x} [{low}, {high}]':>17}" for x, low, high in cells))
+    """One row a figure, one column a pilot; more than one table where the terminal is narrow."""
+    room = max((shutil.get_terminal_size().columns - 12) // 17, 1)
+    for some in (list(figures)[i : i + room] for i in range(0, len(figures), room)):
+        say(f"{'':12}" + "".join(f"{name:>17}" for name in some))
+        for key, (label, factor) in ROWS.items():
+            cells = [[f"{factor * x:.0f}" for x in figures[p][key].values()] for p in some]
+            texts = [f"{x} [{', '.join(ends)}]" if ends else x for x, *ends in cells]
+            say(f"{label:12}" + "".join(f"{text:>17}" for text in texts))
 
 
 @torch.no_grad()
@@ -324,47 +339,56 @@ def track(flight: dict[str, Any], world: World) -> tuple[ndarray, str]:
 
 # -------------------------------------------------- plumbing: skip it on a first reading
 
-HEAD = "     step   eps steps/s min left reward | test: reward over random crossed crash"
-ROW = "{step:9,}{epsilon:6.2f}{speed:8.0f}{eta:9.1f}{train_return:7.1f}{test_return:15.1f}"
-ROW += "{test_over_random:12.0%}{test_crossed:8.0%}{test_crash:6.0%}"
+HEAD = "     step  eps    /s left reward |  test longer cross crash"
+ROW = "{step:9,}{epsilon:5.2f}{speed:6.0f}{eta:5.0f}{train_return:7.1f} |{test_return:6.1f}"
+ROW += "{test_over_random:7.0%}{test_crossed:6.0%}{test_crash:6.0%}"
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, kill, a closed terminal
 
 
 class Run:
-    """What a training asks of the machine: a folder, a log, a clock, a checkpoint, Ctrl-C."""
+    """What a training asks of the machine: a log, a clock, a checkpoint, Ctrl-C."""
 
     def __init__(self, folder: Path, c: DQNConfig, rc: RunConfig, parts: Any, saved: Any) -> None:
-        """Take hold of the folder, and begin there or go on where the checkpoint stands."""
+        """Begin, or go on where the checkpoint `saved` stands. Nothing is written before that."""
         torch.set_flush_denormal(True)  # else RMSprop's dead moments, below 1e-38, halve the speed
         torch.set_num_threads(rc.threads)
         self.folder, self.c, self.rc, self.stopped = folder, c, rc, 0
         self.agent, self.replay, self.fleet, self.rng = parts
         self.book = {"step": 0, "episodes": 0, "seconds": 0.0, "recent": [], "log": [], "best": []}
-        folder.mkdir(parents=True, exist_ok=True)
-        self.lock = dqn.lock_folder(folder)
-        self.handlers = {n: signal.signal(n, self.stop) for n in (signal.SIGINT, signal.SIGTERM)}
+        self.book["bar"] = 0.0  # steps that random flies through the test forests
         if saved:
             self.restore(saved)
         else:
             bar = fly_random(TESTS, self.fleet.world, np.random.default_rng(0))
-            self.book["bar"] = measure(bar)["steps"].mean().item()  # steps that random flies
+            self.book["bar"] = measure(bar)["steps"].mean().item()
+        folder.mkdir(parents=True, exist_ok=True)
         self.save()
-        settings = json.dumps(asdict(c) | asdict(rc), indent=2)
-        dqn.write_whole(folder / "config.json", settings.encode())
-        print(f"to {folder}; its best.pt holds the best weights so far, at last their mean\n")
-        print(HEAD, flush=True)
-        self.started = time.perf_counter() - self.book["seconds"]
+        with dqn.whole_file(folder / "config.json") as file:
+            file.write(json.dumps(asdict(c) | asdict(rc), indent=2).encode())
 
     def steps(self) -> Iterator[int]:
         """The numbers of the control steps to come, until the last or a signal."""
-        while self.book["step"] < self.c.steps and not self.stopped:
-            self.book["step"] += self.c.num_envs
-            yield self.book["step"]
+        # Python takes signals in the main thread only. One that is ignored stays so: nohup.
+        taken = STOPS if threading.current_thread() is threading.main_thread() else ()
+        taken = [n for n in taken if signal.getsignal(n) != signal.SIG_IGN]
+        handlers = {n: signal.signal(n, self.stop) for n in taken}
+        self.started = time.perf_counter() - self.book["seconds"]
+        steps = math.ceil(self.c.steps / self.c.num_envs) * self.c.num_envs
+        try:
+            say(f"to {self.folder}: {steps:,} steps, {self.c.num_envs} at a time\n\n{HEAD}")
+            while self.book["step"] < self.c.steps and not self.stopped:
+                self.book["step"] += self.c.num_envs
+                yield self.book["step"]
+        finally:
+            for n, handler in handlers.items():
+                signal.signal(n, handler)
 
     def stop(self, number: int, _frame: object) -> None:
-        """A first Ctrl-C or SIGTERM lets the step end and saves; a second stops at once."""
+        """A first signal lets the step end and saves; a second stops at once."""
         if self.stopped:
             raise KeyboardInterrupt
         self.stopped = number
+        say("\nstopping: this step ends and is saved; once more stops at once", file=sys.stderr)
 
     @property
     def last_share(self) -> bool:
@@ -394,6 +418,7 @@ class Run:
         because the best of many scores is partly luck."""
         book, late = self.book, self.last_share and self.agent.mean.n_averaged > 0
         q = self.agent.mean.module if late else self.agent.q
+        q = copy.deepcopy(q).half().float()  # what best.pt keeps is in half precision: fly that
         row = {"step": book["step"], "episodes": book["episodes"], "updates": self.agent.updates}
         row["epsilon"] = epsilon
         recent = book["recent"] or [env.flight() for env in self.fleet.envs]  # if none has landed
@@ -401,28 +426,51 @@ class Run:
         for who, flights in flown.items():
             row |= {f"{who}_{key}": x.mean().item() for key, x in measure(flights).items()}
         row["test_over_random"] = row["test_steps"] / book["bar"] - 1
-        book["log"].append(row)
-        lines = [",".join(map(str, line)) for line in (row, *(x.values() for x in book["log"]))]
-        dqn.write_whole(self.folder / "log.csv", "\n".join([*lines, ""]).encode())
+        book["log"] = [*(book["log"] or [",".join(row)]), ",".join(map(str, row.values()))]
+        with dqn.whole_file(self.folder / "log.csv") as file:
+            file.write("\n".join([*book["log"], ""]).encode())
         score = [row["test_goal" if self.rc.beacon else "test_crossed"], row["test_progress"]]
         if late or score > book["best"]:
             book["best"] = score
             dqn.save_weights(self.folder / "best.pt", q, beacon=self.rc.beacon)
-        print(ROW.format(**row | self.clock), flush=True)
+        say(ROW.format(**row | self.clock))
 
-    def save(self) -> None:
-        """Write the checkpoint: 34 MB; of the replay only each flight's seed and actions."""
+    def content(self) -> dict[str, Any]:
+        """What a checkpoint holds: 34 MB; of the replay only each flight's seed and actions."""
         content = {"settings": asdict(self.c) | asdict(self.rc), "machine": dqn.MACHINE}
         content |= {"agent": self.agent.state_dict(), "rng": self.rng.bit_generator.state}
-        content |= {"added": self.replay.added, "flights": self.fleet.record(self.replay.rows)}
-        dqn.save(self.folder / "checkpoint.pt", "checkpoint", content | {"book": self.book})
+        return content | {"flights": self.fleet.record(self.replay.rows), "book": self.book}
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+        dqn.save(self.folder / "checkpoint.pt", "checkpoint", self.content())
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Fly the saved replay again, then set everything else as it was."""
-        replay, fleet, rows = self.replay, self.fleet, min(saved["added"], self.replay.rows)
-        replay.added = saved["added"] - rows
-        seeds = [iter([seed for seed, _ in lane]) for lane in saved["flights"]]
-        digits = ["".join(actions for _, actions in lane) for lane in saved["flights"]]
+        """Check that a checkpoint is like one of ours, and set everything as it was."""
+        flight = self.fleet.envs[0].flight()
+        like = self.content() | {"flights": [[(0, "")]]}
+        like["book"] = self.book | {"recent": [flight], "log": [""], "best": [0.0]}
+        dqn.check_like(saved, like, self.folder / "checkpoint.pt")
+        self.book = saved["book"]
+        if (flown := self.book["step"]) >= self.c.steps:
+            raise ValueError(f"{self.folder} has flown {flown:,} steps: give more by --steps")
+        try:
+            self.refill(saved["flights"])
+            self.rng.bit_generator.state = saved["rng"]
+        except (ValueError, LookupError, StopIteration, OverflowError):
+            text = f"{self.folder} cannot be flown again here; is it another machine's?"
+            raise ValueError(text) from None
+        self.agent.load_state_dict(saved["agent"])
+        if not self.last_share:  # a longer training takes the mean of its own last share
+            self.agent.mean.n_averaged.zero_()
+
+    def refill(self, flights: list[list[tuple[int, str]]]) -> None:
+        """Fill the replay by flying all its flights again, those of each lane one after another."""
+        replay, fleet = self.replay, self.fleet
+        rows = min(self.book["step"] // self.c.num_envs, replay.rows)
+        replay.added = self.book["step"] // self.c.num_envs - rows
+        seeds = [iter([seed for seed, _ in lane]) for lane in flights]
+        digits = ["".join(actions for _, actions in lane) for lane in flights]
         for lane, actions in enumerate(digits if rows else ()):
             fleet.reset([lane], [next(seeds[lane])])
             for a in actions[:-rows]:  # their pictures were overwritten already
@@ -430,27 +478,29 @@ class Run:
         for row in range(-rows, 0):
             show(f"flying the replay again: {-row * len(digits):,} steps to go")
             fleet.reset(fleet.landed, [next(seeds[lane], 0) for lane in fleet.landed])
-            s, a = fleet.observations, np.array([int(actions[row]) for actions in digits])
+            s, a = fleet.observations, [int(actions[row]) for actions in digits]
             s2, r, terminated, truncated, infos = fleet.step(a)
             r = learner_reward(r, infos, self.rc, self.c.gamma)
             replay.add(s, a, r, s2, np.where(terminated, dqn.TERMINAL, dqn.TRUNCATED * truncated))
-        if fleet.record(replay.rows) != saved["flights"]:
-            raise ValueError(f"{self.folder}: its flights fly otherwise here; another machine?")
-        self.book, self.rng.bit_generator.state = saved["book"], saved["rng"]
-        self.agent.load_state_dict(saved["agent"])
-        if not self.last_share:  # a longer training takes the mean of its own last share
-            self.agent.mean.n_averaged.zero_()
+        show("")
+        if fleet.record(replay.rows) != flights:
+            raise ValueError("other flights")
 
     def finish(self) -> int:
         """The exit code: 0; or, saved and with the command that goes on, 128 and the signal."""
-        for number, handler in self.handlers.items():
-            signal.signal(number, handler)
-        if self.book["step"] >= self.c.steps:
+        if not self.stopped:
             return 0
         self.save()
-        again = [sys.orig_argv[0], sys.argv[0], "train", "--resume", str(self.folder)]
-        print(f"\nsaved at step {self.book['step']:,}; to go on:\n{shlex.join(again)}")
+        say(f"saved at step {self.book['step']:,}; {resume_line(self.folder)}", file=sys.stderr)
         return 128 + self.stopped
+
+
+def resume_line(folder: Path) -> str:
+    """How to go on with a training, from wherever one is."""
+    script, folder = Path(__file__).resolve(), folder.resolve()
+    return (
+        f"to go on:\n{shlex.join([sys.executable, str(script), 'train', '--resume', str(folder)])}"
+    )
 
 
 class Parser(argparse.ArgumentParser):
@@ -458,31 +508,54 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong, and no more."""
-        self.exit(2, f"{self.prog}: error: {message}\n")
+        raise ValueError(message)
+
+
+def place(text: str) -> Path:
+    """A path on the command line."""
+    if not text:
+        raise argparse.ArgumentTypeError("is empty, needed is the name of a file or folder")
+    return Path(text)
+
+
+def describe(f: Field) -> str:
+    """The help of a setting's flag: what it is, what is allowed, what the presets make of it."""
+    low, high = f.metadata["legal"]
+    notes = [
+        "true or false" if f.type is bool else f"{low:,g} to {high:,g}",
+        f"default {f.default}",
+    ]
+    for name, preset in (("mnih", MNIH), ("beacon", BEACON)):
+        notes += [f"{name} {preset[f.name]}"] if f.name in preset else []
+    return f"{f.metadata['help']} ({'; '.join(notes)})"
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Read the command line; every setting is a flag of `train`."""
+    """Read the command line; every setting is a flag of `train`. Raises ValueError."""
     parser = Parser(prog="deepflight.py", description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
     sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
-    sub.set_defaults(run=start_training, preset="default", name="", resume=None)
+    sub.set_defaults(run=start_training, preset="default", name=None, resume=None)
     sub.add_argument("--preset", choices=("default", "mnih"), help="mnih: [Mnih15]'s parameters")
     sub.add_argument("--name", help="name of the folder in runs/; by default a new number")
-    sub.add_argument("--resume", type=Path, help="folder of a training to go on with")
+    sub.add_argument("--resume", type=place, help="folder of a training to go on with")
     for f in SETTINGS:
         kind = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type}
-        sub.add_argument("--" + f.name.replace("_", "-"), help=f.metadata["help"], **kind)
+        sub.add_argument("--" + f.name.replace("_", "-"), help=describe(f), **kind)
     sub = commands.add_parser("eval", help="fly trained weights against three other pilots")
     sub.set_defaults(run=evaluate)
     names = ("random", "straight", "laser", "dqn")
-    sub.add_argument("--weights", type=Path, help="default: weights/paper.pt or weights/beacon.pt")
-    sub.add_argument("--pilots", nargs="+", choices=names, default=names, help="which to show")
-    sub.add_argument("--episodes", type=int, default=100, help="forests, the same for every pilot")
-    sub.add_argument("--first-seed", type=int, default=EVAL_FIRST, help="of the first forest")
+    sub.add_argument("--weights", type=place, help="default: weights/paper.pt or weights/beacon.pt")
+    more = {"choices": names, "default": names, "metavar": "PILOT"}
+    sub.add_argument("--pilots", nargs="+", **more, help=f"of {', '.join(names)}; default: all")
+    more = {"type": int, "metavar": "N"}
+    sub.add_argument("--episodes", **more, default=100, help="forests, up to 1e6; default: 100")
+    first = "forest to begin with, up to 1e18; default: %(default)s"
+    sub.add_argument("--first-seed", **more, default=EVAL_FIRST, help=first)
     sub.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
-    sub.add_argument("--json", type=Path, metavar="FILE", help="write every figure and flight")
-    sub.add_argument("--out", type=Path, default="runs/eval", help="folder of the pictures")
+    sub.add_argument("--json", type=place, metavar="FILE", help="write every figure and flight")
+    sub.add_argument("--out", type=place, default="runs/eval", help="folder of the film")
+    sub.add_argument("--threads", **more, help="of the CPU; default: OMP_NUM_THREADS or 2")
     return parser.parse_args(argv)
 
 
@@ -490,21 +563,43 @@ def start_training(args: argparse.Namespace) -> int:
     """Check all that is given before anything is written, then train."""
     given = {f.name: vars(args)[f.name] for f in SETTINGS if f.name in args}
     if args.resume:
-        saved = dqn.load(args.resume / "checkpoint.pt", "checkpoint")
-        if given.keys() - {"steps"} or args.name or args.preset != "default":
+        if given.keys() - {"steps"} or args.name is not None or args.preset != "default":
             raise ValueError(f"{args.resume} keeps its own settings: give none but --steps")
-        if saved["machine"] != dqn.MACHINE:
-            raise ValueError(f"{args.resume} is of {saved['machine']}, here is {dqn.MACHINE}")
-        c, rc = configure(saved["settings"] | given)
-        if (flown := saved["book"]["step"]) >= c.steps:
-            raise ValueError(f"{args.resume} has flown {flown:,} steps: give more by --steps")
-        return train(c, rc, args.resume, saved)
+        return resume_training(args.resume, given)
+    if args.name is not None and not re.fullmatch(r"\w[\w.-]{0,99}", args.name, re.ASCII):
+        legal = "up to 100 letters, digits, dots, dashes and underscores"
+        raise ValueError(f"name is {args.name!r}, allowed are {legal}")
     preset = (BEACON if given.get("beacon") else {}) | (MNIH if args.preset == "mnih" else {})
+    c, rc = configure(preset | given)
     numbers = (Path(f"runs/{i:03d}") for i in range(1, 10**6))
     folder = Path("runs") / args.name if args.name else next(p for p in numbers if not p.exists())
-    if folder.parent != Path("runs") or folder.name == ".." or folder.exists():
-        raise ValueError(f"name is {args.name!r}, allowed is one that runs/ does not have yet")
-    return train(*configure(preset | given), folder)
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        text = f"{folder} cannot be made: {error.strerror} (to go on with a training: --resume)"
+        raise ValueError(text) from None
+    args.resume = folder  # should it be interrupted
+    try:
+        with dqn.lock_folder(folder):
+            return train(c, rc, folder)
+    finally:
+        if not (folder / "checkpoint.pt").exists():
+            shutil.rmtree(folder)
+
+
+def resume_training(folder: Path, given: dict[str, Any]) -> int:
+    """Hold the folder, then read its checkpoint, and go on."""
+    if not (folder / "checkpoint.pt").is_file():
+        raise ValueError(f"{folder} holds no checkpoint.pt: give the folder of a training")
+    with dqn.lock_folder(folder):
+        for name in ("best.pt", "config.json", "log.csv"):
+            dqn.check_output(folder / name, b"")
+        saved = dqn.load(folder / "checkpoint.pt", "checkpoint")
+        like = {"settings": asdict(DQNConfig()) | asdict(RunConfig()), "machine": dqn.MACHINE}
+        dqn.check_like({key: saved.get(key) for key in like}, like, folder / "checkpoint.pt")
+        if saved["machine"] != dqn.MACHINE:
+            raise ValueError(f"{folder} is of {saved['machine']}, here is {dqn.MACHINE}")
+        return train(*configure(saved["settings"] | given), folder, saved)
 
 
 def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
@@ -514,42 +609,62 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
     for settings in (c, rc):
         env.check_numbers(settings, {f.name: f.metadata["legal"] for f in fields(settings)})
     # The least: three rows to complete a stack, n_steps that wait for rewards, one to draw.
-    for name in ("replay_size", "learning_starts"):
-        if (value := getattr(c, name)) < (least := c.num_envs * (c.n_steps + 4)):
-            raise ValueError(f"{name} is {value}, below num_envs * (n_steps + 4) = {least}")
+    window = c.num_envs * (c.n_steps + 4)
+    for name, least, rule in (
+        ("replay_size", window, "num_envs * (n_steps + 4)"),
+        ("learning_starts", window, "num_envs * (n_steps + 4)"),
+        ("steps", c.learning_starts + 1, "learning_starts + 1"),
+    ):
+        if (value := getattr(c, name)) < least:
+            raise ValueError(f"{name} is {value}, allowed are numbers from {rule} = {least}")
     return c, rc
 
 
 def load_pilot(args: argparse.Namespace) -> QNetwork:
-    """Read the weights; check all that is given, before anything flies."""
-    for name, least in (("episodes", 1), ("first_seed", 0)):
-        if (value := vars(args)[name]) < least:
-            raise ValueError(f"{name} is {value}, allowed are whole numbers from {least}")
-    path = args.json or Path("new.json")
-    if (path.exists() and not path.is_file()) or not path.absolute().parent.is_dir():
-        raise ValueError(f"json is {path}, allowed is a file in a folder that exists")
+    """Check all that is given before anything flies, and read the weights. Raises ValueError."""
+    if args.threads is None:  # torch has read OMP_NUM_THREADS
+        known = "OMP_NUM_THREADS" in os.environ
+        args.threads = torch.get_num_threads() if known else RunConfig.threads
+    for name, low, high in (
+        ("episodes", 1, 10**6), ("first_seed", 0, 10**18), ("threads", 1, 256)
+    ):  # fmt: skip
+        if not low <= (value := vars(args)[name]) <= high:
+            raise ValueError(f"{name} is {value}, allowed are whole numbers from {low} to {high:,}")
+    torch.set_num_threads(args.threads)
     shipped = Path(__file__).parent / "weights" / ("beacon.pt" if args.beacon else "paper.pt")
     args.weights = args.weights or shipped
     q = dqn.load_weights(args.weights, World.actions, beacon=args.beacon)
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"out is {args.out}, allowed is a folder: {error}") from None
+    outputs = [args.out / "flight.gif", *([args.json] if args.json else [])]
+    for path in outputs:
+        dqn.check_output(path, b"Deep Flight")
+    if len({os.path.realpath(path) for path in outputs}) < len(outputs):
+        raise ValueError(f"json is {args.json}, which is the film's file: name another")
+    for path in outputs:
+        Path(os.path.realpath(path)).parent.mkdir(parents=True, exist_ok=True)
     return q
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; what goes wrong is one line: bad input exit code 2, trouble on the way 1."""
-    args = parse(argv)
+    args = argparse.Namespace()
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        stream.reconfigure(errors="backslashreplace")  # a name that cannot be printed is no trouble
     try:
+        args = parse(argv)
         return args.run(args)
     except (ValueError, MemoryError, FloatingPointError, OSError) as error:
-        print(f"deepflight.py {args.command}: error: {error}", file=sys.stderr)
+        text = "".join(x if x.isprintable() else "?" for x in str(error))
+        say(f"deepflight.py: error: {text}", file=sys.stderr)
         return 1 if isinstance(error, FloatingPointError | OSError) else 2
     except KeyboardInterrupt:
-        print("\ninterrupted", file=sys.stderr)
+        folder = vars(args).get("resume")
+        saved = folder and (folder / "checkpoint.pt").exists()
+        say("\ninterrupted" + (f"; {resume_line(folder)}" if saved else ""), file=sys.stderr)
         return 130
+    finally:
+        say("", end="")  # what was printed last
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, CTRL_C)
     sys.exit(main())

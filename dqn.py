@@ -101,14 +101,17 @@ Legend
 Not in this file: the forest, prioritized replay, distributional values, noisy layers.
 """
 
+import fcntl
 import hashlib
 import io
 import os
-import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from pickle import UnpicklingError
-from typing import Any, NamedTuple
+from tempfile import NamedTemporaryFile
+from typing import Any, BinaryIO, NamedTuple
+from zipfile import ZipFile
 
 import numpy as np
 import torch
@@ -124,9 +127,9 @@ from torch.optim.swa_utils import AveragedModel
 LIVE, TRUNCATED, TERMINAL = range(3)
 
 
-def setting(value: Any, text: str, low: float, high: float = np.inf) -> Any:
+def setting(value: Any, text: str, low: float, high: float = 1e9) -> Any:
     """One field of the settings: its default, a text with unit and source, and what is allowed."""
-    return field(default=value, metadata=dict(help=f"{text} (default: {value})", legal=(low, high)))
+    return field(default=value, metadata={"help": text, "legal": (low, high)})
 
 
 @dataclass(frozen=True)
@@ -135,7 +138,7 @@ class DQNConfig:
 
     steps: int = setting(300_000, "control steps in all", 1)
     gamma: float = setting(0.99, "discount per step [DF II-A]", 0, 1)
-    replay_size: int = setting(200_000, "transitions remembered, 7.1 kB each", 1)
+    replay_size: int = setting(200_000, "transitions remembered, 7.1 kB each", 1, 1e7)
     learning_starts: int = setting(5_000, "control steps before the first update", 1)
     update_every: int = setting(4, "control steps per update [Mnih15]", 1)
     batch_size: int = setting(32, "transitions per update [Mnih15]", 1, 10_000)
@@ -151,8 +154,8 @@ class DQNConfig:
     huber: float = setting(100.0, "[+] errors above it pull no harder; 1: Mnih's", 1e-3, 1e6)
     huber_after: int = setting(100_000, "[+] control steps with Mnih's 1, then huber", 0)
     lr_decay: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
-    max_grad_norm: float = setting(10.0, "[+] longer gradients are cut to this; 0: off", 0)
-    average: float = setting(0.1, "[+] last share of the steps, averaged to fly; 0: off", 0, 1)
+    max_grad_norm: float = setting(10.0, "[+] longer gradients are cut to this; 0: off", 0, 1e6)
+    average: float = setting(0.1, "[+] last share of the steps, averaged to fly; 0: off", 0, 0.5)
     bfloat16: bool = setting(True, "[+] quick convolutions if the CPU has it; --no-bfloat16", 0, 1)
 
 
@@ -339,14 +342,23 @@ class Agent(nn.Module):
         self.q_target.load_state_dict(self.q.state_dict())  # line 3
         self.mean = AveragedModel(self.q)  # [+average]
         self.optimizer = make_optimizer(self.q.parameters(), c)
+        # An update by a gradient of 0 moves no weight, and makes the optimizer's running means. So
+        # every checkpoint holds the same tensors. Adam's count of updates goes back to 0.
+        for w in self.q.parameters():
+            w.grad = torch.zeros_like(w)
+        self.optimizer.step()
+        for means in self.optimizer.state.values():
+            means.get("step", torch.zeros(())).zero_()
 
     def get_extra_state(self) -> dict[str, Any]:
         """What a checkpoint needs besides weights; PyTorch's state_dict calls this."""
-        return {"optimizer": self.optimizer.state_dict(), "updates": self.updates}
+        return {"means": self.optimizer.state_dict()["state"], "updates": self.updates}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Take it up again; PyTorch's load_state_dict calls this."""
-        self.optimizer.load_state_dict(state["optimizer"])
+        for i, means in enumerate(self.optimizer.state.values()):
+            for name, tensor in means.items():
+                tensor.copy_(state["means"][i][name])
         self.updates = state["updates"]
 
 
@@ -404,73 +416,131 @@ MACHINE = {"torch": str(torch.__version__), "bfloat16": HAS_BFLOAT16}  # another
 
 # -------------------------------------------------- files: skip this on a first reading
 
+LARGEST = 2**30  # bytes of a file that is read; a checkpoint has 34 MB
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file so that the old one or the new one is there, whole, whenever the power fails."""
-    part = path.with_name(path.name + ".part")
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """A file to write. It stands under its name when it is whole, and till then the old one does.
+
+    Links are followed to their target. Raises OSError where nothing can be written.
+    """
+    target = Path(os.path.realpath(path))
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        with part.open("wb") as file:
-            file.write(data)
+        with part.open("xb") as file:
+            yield file
             file.flush()
             os.fsync(file.fileno())
-        part.replace(path)
+        part.replace(target)
     finally:
         part.unlink(missing_ok=True)
+
+
+def check_output(path: Path, mark: bytes) -> None:
+    """Raise ValueError unless a file can be written there, and the name is free or that of a file
+    which has this mark in its first 1,000 bytes: then we wrote it, and may replace it."""
+    try:
+        target = Path(os.path.realpath(path))
+        if os.path.lexists(target) and not (
+            target.is_file() and mark in target.open("rb").read(1000)
+        ):
+            raise ValueError(f"{path} exists, and this program did not write it: name another file")
+        folder = next(parent for parent in target.parents if parent.exists())
+        with NamedTemporaryFile(dir=folder, prefix=f".{target.name}.{os.getpid()}.part"):
+            pass  # so a file can be made there
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def save(path: Path, kind: str, content: dict) -> None:
     """Write tensors and plain values with torch.save, and behind them their SHA-256."""
     buffer = io.BytesIO()
     torch.save({"kind": kind} | content, buffer)
-    write_whole(path, buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
+    with whole_file(path) as file:
+        file.write(buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
 
 
 def load(path: Path, kind: str) -> dict:
     """Read what save wrote, or raise ValueError; no code from the file is ever run.
 
-    The digest comes first, because torch.load takes flipped bits for numbers. PK begins every
-    archive of torch.save.
+    The digest comes first, because torch.load takes flipped bits for numbers. A file that was made
+    on purpose can have the right one. So `check_like` has to look at what this returns.
     """
     try:
-        data = path.read_bytes()
-        if data[:2] != b"PK" or hashlib.sha256(data[:-32]).digest() != data[-32:]:
+        if not path.is_file() or path.stat().st_size > LARGEST:
+            raise ValueError(f"{path} is no file of {kind}, such as train writes to runs/001")
+        archive, digest = (data := path.read_bytes())[:-32], data[-32:]
+        if hashlib.sha256(archive).digest() != digest:
             raise ValueError(f"{path} is damaged, or no file of Deep Flight: its digest is wrong")
-        content = torch.load(io.BytesIO(data[:-32]), weights_only=True)
-        if content["kind"] != kind:
-            raise ValueError(f"{path} holds {content['kind']}, needed: {kind}")
-        return content
-    except (OSError, EOFError, LookupError, RuntimeError, TypeError, UnpicklingError) as error:
-        raise ValueError(f"{path} cannot be read: {error}".partition("\n")[0]) from None
+        if sum(x.file_size for x in ZipFile(io.BytesIO(archive)).infolist()) > LARGEST:
+            raise ValueError(f"{path} is larger inside than {LARGEST:,} bytes")
+        content = torch.load(io.BytesIO(archive), weights_only=True)
+    except (ValueError, OSError):
+        raise
+    except Exception as error:  # such an archive can fail in torch.load in any way
+        raise ValueError(f"{path} cannot be read: {type(error).__name__}") from None
+    if not isinstance(content, dict) or content.pop("kind", None) != kind:
+        raise ValueError(f"{path} holds something else than {kind}")
+    return content
+
+
+def check_like(found: Any, like: Any, where: object) -> None:
+    """Raise ValueError unless what a file holds is built like what we would write: the same types,
+    keys, shapes and dtypes, finite numbers, and whole numbers from 0. A list may hold any number of
+    things, all like the first one of `like`."""
+    if type(found) is not type(like):
+        raise ValueError(f"{where} is of type {type(found).__name__}, not {type(like).__name__}")
+    if isinstance(like, list):
+        like = like[:1] * len(found)
+    if isinstance(like, list | tuple):
+        found, like = dict(enumerate(found)), dict(enumerate(like))
+    if isinstance(like, dict):
+        if found.keys() != like.keys():
+            raise ValueError(f"{where} holds other things than {', '.join(map(str, like))}")
+        for key in like:
+            check_like(found[key], like[key], f"{where}: {key}")
+    elif isinstance(like, Tensor):
+        for trait in ("dtype", "layout", "device", "shape"):
+            if (a := getattr(found, trait)) != (b := getattr(like, trait)):
+                raise ValueError(f"{where} is a tensor of {trait} {a}, not {b}")
+    numbers = isinstance(like, Tensor | float) and not torch.as_tensor(found).isfinite().all()
+    if numbers or (isinstance(like, int) and not 0 <= found < 2**128):
+        raise ValueError(f"{where} is no number that can be: not finite, negative or too large")
+
+
+def pack(q: QNetwork, world: dict[str, Any]) -> dict[str, Any]:
+    """What a weights file holds: a network in half precision, and what world it was trained in."""
+    return {"network": {name: value.half() for name, value in q.state_dict().items()}} | world
 
 
 def save_weights(path: Path, q: QNetwork, **world: Any) -> None:
-    """Write a network in half precision, 3.4 MB, and what world it was trained in."""
-    half = {name: value.half() for name, value in q.state_dict().items()}
-    if not all(value.isfinite().all() for value in half.values()):
+    """Write a weights file, 3.4 MB. Raises FloatingPointError if a weight is no finite number."""
+    content = pack(q, world)
+    if not all(value.isfinite().all() for value in content["network"].values()):
         raise FloatingPointError(f"{path} is not written: some weights are no finite numbers")
-    save(path, "weights", {"network": half} | world)
+    save(path, "weights", content)
 
 
 def load_weights(path: Path, actions: int, **world: Any) -> QNetwork:
     """Read what save_weights wrote, in that same world. Raises ValueError."""
     saved, q = load(path, "weights"), QNetwork(actions)
-    shapes = [{k: tuple(v.shape) for k, v in x.items()} for x in (saved["network"], q.state_dict())]
-    if shapes[0] != shapes[1]:
-        raise ValueError(f"{path} holds another network: {shapes[0]}, needed: {shapes[1]}")
+    check_like(saved, pack(q, world), path)
     if other := {key: saved[key] for key in world if saved[key] != world[key]}:
         raise ValueError(f"{path} was trained with {other}, here is {world}")
     q.load_state_dict(saved["network"])
     return q
 
 
-def lock_folder(folder: Path) -> sqlite3.Connection:
-    """Keep a second process out as long as what this returns is held, however it is let go.
-
-    SQLite's lock is the one in the standard library that works everywhere and dies with its owner.
-    """
+@contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Keep other processes out as long as this one is inside, however it ends."""
+    handle = os.open(folder, os.O_RDONLY)
     try:
-        lock = sqlite3.connect(folder / "lock", timeout=0, isolation_level=None)
-        lock.execute("BEGIN EXCLUSIVE")
-    except sqlite3.Error as error:
-        raise ValueError(f"{folder} is another training's, or cannot be held: {error}") from None
-    return lock
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"{folder} is another training's, which still runs") from None
+        yield
+    finally:
+        os.close(handle)

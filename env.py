@@ -62,12 +62,14 @@ environment (the usual interface in this field) and does not need gymnasium.
 
 import math
 import operator
+import os
+import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import pymunk
@@ -166,7 +168,8 @@ class ForestEnv:
         self.bark = [pymunk.Circle(ground, radius) for _ in grid(self.world)]
         self.drone = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self.space.add(self.drone, *self.bark)
-        self.seed, self.outcome, self.actions = -1, "not reset", []  # any outcome counts as landed
+        self.seed, self.actions, self.edge, self.progress, self.total = -1, [], "", 0.0, 0.0
+        self.outcome = "not reset"  # any outcome counts as landed
 
     def reset(self, *, seed: int | None = None, options: object = None) -> tuple[ndarray, dict]:
         """Plant forest number `seed`, or the one after the last, and stand at the start.
@@ -403,6 +406,7 @@ def fly(pilot: Pilot, seeds: Sequence[int], world: World, *, camera: bool = True
             show(f"{len(flights) + len(group) - len(flying):,} of {len(seeds):,} flights landed")
             fleet.step(pilot(fleet))
         flights += [env.flight() for env in fleet.envs[: len(group)]]
+    show("")
     return flights
 
 
@@ -423,10 +427,20 @@ def measure(flights: Flights) -> dict[str, ndarray]:
     return table | {o: np.array([f["outcome"] == o for f in flights]) for o in OUTCOMES}
 
 
+def say(text: str, end: str = "\n", file: TextIO | None = None) -> None:
+    """Print, and work on if nobody reads: what goes to a closed pipe or terminal is lost."""
+    file = file or sys.stdout
+    try:
+        print(text, end=end, file=file, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
+
+
 def show(text: str) -> None:
-    """Show a passing status on a terminal; nothing when piped."""
-    if sys.stdout.isatty():
-        print(f"\r{text}\x1b[K\r", end="", flush=True)
+    """Show a passing status on a terminal, over the last one; nothing when piped."""
+    if sys.stdout and sys.stdout.isatty() and os.environ.get("TERM") != "dumb":
+        room = shutil.get_terminal_size().columns - 1
+        say(f"{text[:room]:{room}}", "\r")
 
 
 # -------------------------------------------------- legal worlds: skip this on a first reading

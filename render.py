@@ -59,6 +59,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy import ndarray
@@ -272,7 +273,8 @@ def draw_panel(
     return image
 
 
-def save_film(file: Path, pictures: Iterator[Image.Image], milliseconds: int) -> None:
-    """Write an endless GIF, picture by picture as they come."""
+def save_film(file: Path | BinaryIO, pictures: Iterator[Image.Image], milliseconds: int) -> None:
+    """Write an endless GIF, picture by picture as they come. Its comment says who wrote it."""
     small = (picture.quantize(64, Image.Quantize.FASTOCTREE) for picture in pictures)
-    next(small).save(file, save_all=True, append_images=small, duration=milliseconds, loop=0)
+    more = {"append_images": small, "duration": milliseconds, "loop": 0, "comment": b"Deep Flight"}
+    next(small).save(file, "GIF", save_all=True, **more)

@@ -2,13 +2,14 @@
 
 import hashlib
 import io
+import os
 import pickle
 import resource
-import signal
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 import pytest
@@ -28,6 +29,8 @@ from dqn import (
     QNetwork,
     Replay,
     RMSprop,
+    check_like,
+    check_output,
     greedy,
     linear_schedule,
     load,
@@ -37,7 +40,7 @@ from dqn import (
     save,
     save_weights,
     td_target,
-    write_whole,
+    whole_file,
 )
 from env import World
 
@@ -411,7 +414,7 @@ class Corridor:
         """Observations, rewards, terminated, truncated and infos of all walkers."""
         r = [walker.step(int(a)) for walker, a in zip(self.envs, actions, strict=True)]
         terminated = np.array([walker.outcome != "" for walker in self.envs])
-        infos = [{"forward": 0.0, "outcome": walker.outcome} for walker in self.envs]
+        infos = [{"forward": 0.0, "outcome": walker.outcome, "edge": ""} for walker in self.envs]
         return self.observations, np.array(r), terminated, np.zeros_like(terminated), infos
 
     def record(self, steps: int) -> list[list[tuple[int, str]]]:
@@ -427,14 +430,9 @@ def stripe(cell: int) -> np.ndarray:
 
 
 @pytest.fixture(autouse=True)
-def alone() -> Iterator[None]:
-    """One thread, because another may wait for a busy core; and signals given back after."""
+def alone() -> None:
+    """One thread, because another may wait for a busy core."""
     torch.set_num_threads(1)
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.getsignal(number) for number in numbers]
-    yield
-    for number, handler in zip(numbers, before, strict=True):
-        signal.signal(number, handler)
 
 
 SHORT = partial(World, actions=2, max_steps=5)  # of the test flights and the random ones
@@ -456,7 +454,8 @@ def corridor(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("corridor")
 def test_a_training_solves_a_tiny_mdp(n_steps: int, steps: int, tmp_path: Path) -> None:
     assert train(replace(WALK, n_steps=n_steps, steps=steps), PLAIN, tmp_path) == 0
-    q, states = load_weights(tmp_path / "best.pt", 2), np.stack([stripe(x) for x in range(4)])
+    q = load_weights(tmp_path / "best.pt", 2, beacon=False)
+    states = np.stack([stripe(x) for x in range(4)])
     assert greedy(q, states).tolist() == [1, 1, 1, 1]
     if n_steps == 1:  # longer windows of a random walk are off-policy, so their values are lower
         best = q(torch.from_numpy(states)).max(1).values.detach().numpy()
@@ -476,7 +475,7 @@ def strides(c: DQNConfig, folder: Path) -> list[tuple[float, torch.Tensor]]:
         assert train(c, PLAIN, folder) == 0
     finally:
         hook.remove()
-    return taken
+    return taken[1:]  # the first is Agent's own, by a gradient of 0
 
 
 @pytest.mark.usefixtures("corridor")
@@ -495,7 +494,7 @@ def test_the_target_network_is_an_old_copy_and_in_the_end_the_mean_of_the_weight
     mean = torch.stack(newest[-30:]).mean(0)
     assert torch.allclose(agent.mean.module.head[2].weight, mean, rtol=0, atol=1e-6)
     assert not torch.allclose(newest[-1], mean, rtol=0, atol=1e-4)
-    best = load_weights(tmp_path / "best.pt", 2).state_dict()
+    best = load_weights(tmp_path / "best.pt", 2, beacon=False).state_dict()
     for name, value in agent.mean.module.state_dict().items():
         assert torch.equal(best[name], value.half().float())
 
@@ -508,7 +507,9 @@ def test_where_the_copy_falls_on_the_last_update_both_networks_are_equal(tmp_pat
     agent.load_state_dict(load(tmp_path / "checkpoint.pt", "checkpoint")["agent"])
     assert agent.updates == 10
     assert same(agent.q, agent.q_target)
-    assert same(load_weights(tmp_path / "best.pt", 2), agent.q.half().float())  # no mean: Q flies
+    assert same(
+        load_weights(tmp_path / "best.pt", 2, beacon=False), agent.q.half().float()
+    )  # no mean: Q flies
 
 
 @pytest.mark.usefixtures("corridor")
@@ -564,18 +565,79 @@ def test_weights_are_halved_and_fit_their_own_world_and_actions_only(tmp_path: P
         assert torch.equal(value, q.state_dict()[name].half().float())
     with pytest.raises(ValueError, match=r"trained with \{'beacon': True\}, here is"):
         load_weights(path, 9, beacon=False)
-    with pytest.raises(ValueError, match="another network"):
+    with pytest.raises(ValueError, match=r"network: head.2.weight is a tensor of shape"):
         load_weights(path, 5, beacon=True)
 
 
+@pytest.mark.parametrize(
+    ("found", "named"),
+    [
+        ({"n": 1, "x": 0.5, "t": torch.zeros(2), "all": [("a", 1)]}, None),
+        ({"n": 0, "x": -0.5, "t": torch.ones(2), "all": []}, None),
+        ({"n": 1, "x": 0.5, "t": torch.zeros(2), "all": [("a", 1)] * 9}, None),
+        ({"n": 1, "x": 0.5, "t": torch.zeros(2)}, "file holds other things than n, x, t, all"),
+        ({"n": True, "x": 0.5, "t": torch.zeros(2), "all": []}, "file: n is of type bool"),
+        ({"n": -1, "x": 0.5, "t": torch.zeros(2), "all": []}, "file: n is no number that can be"),
+        ({"n": 1, "x": float("nan"), "t": torch.zeros(2), "all": []}, "file: x is no number"),
+        ({"n": 1, "x": 0.5, "t": torch.zeros(3), "all": []}, "file: t is a tensor of shape"),
+        ({"n": 1, "x": 0.5, "t": torch.zeros(2).half(), "all": []}, "file: t is a tensor of dtype"),
+        ({"n": 1, "x": 0.5, "t": torch.zeros(2).to_sparse(), "all": []}, "tensor of layout"),
+        ({"n": 1, "x": 0.5, "t": torch.full((2,), torch.inf), "all": []}, "file: t is no number"),
+        ({"n": 1, "x": 0.5, "t": torch.zeros(2), "all": [("a", 1), ("a",)]}, "file: all: 1 holds"),
+        (
+            {"n": 1, "x": 0.5, "t": torch.zeros(2), "all": [("a", "1")]},
+            "file: all: 0: 1 is of type",
+        ),
+    ],
+)
+def test_what_a_file_holds_is_like_what_we_would_write_or_named(found: dict, named: str) -> None:
+    like = {"n": 7, "x": 1.5, "t": torch.ones(2), "all": [("", 0)]}
+    if named is None:
+        check_like(found, like, "file")
+        return
+    with pytest.raises(ValueError, match=named):
+        check_like(found, like, "file")
+
+
 def test_a_folder_is_held_by_one_at_a_time(tmp_path: Path) -> None:
-    held = lock_folder(tmp_path)
-    with pytest.raises(ValueError, match="another training's"):
-        lock_folder(tmp_path)
-    held.close()
-    lock_folder(tmp_path).close()
-    with pytest.raises(ValueError, match="cannot be held"):
-        lock_folder(tmp_path / "nowhere")
+    with (
+        lock_folder(tmp_path),
+        pytest.raises(ValueError, match="another training's"),
+        lock_folder(tmp_path),
+    ):
+        pass
+    with lock_folder(tmp_path):
+        assert not list(tmp_path.iterdir()), "the lock is no file"
+
+
+def test_a_file_is_written_where_the_name_is_free_or_our_own_and_nowhere_else(
+    tmp_path: Path,
+) -> None:
+    ours, theirs, link, loop = (tmp_path / name for name in ("ours", "theirs", "link", "loop"))
+    ours.write_text('{"program": "Deep Flight"}')
+    theirs.write_text("my diary")
+    link.symlink_to(theirs)
+    loop.symlink_to(loop)
+    os.mkfifo(tmp_path / "pipe")
+    before = sorted(tmp_path.rglob("*"))
+    for path in (ours, tmp_path / "new", tmp_path / "a/b/new"):
+        check_output(path, b"Deep Flight")
+    for path in (theirs, link, loop, tmp_path / "pipe", tmp_path, Path("/dev/null")):
+        with pytest.raises(ValueError, match="this program did not write it"):
+            check_output(path, b"Deep Flight")
+    for path in (theirs / "new", tmp_path / ("x" * 250), Path("/proc/new")):
+        with pytest.raises(ValueError, match="cannot be written"):
+            check_output(path, b"Deep Flight")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_link_is_followed_to_its_target_and_stays_a_link(tmp_path: Path) -> None:
+    target, link = tmp_path / "target", tmp_path / "link"
+    link.symlink_to(target)
+    with whole_file(link) as file:
+        file.write(b"new")
+        assert not target.exists()
+    assert link.is_symlink() and target.read_bytes() == b"new"
 
 
 def test_a_file_with_any_byte_changed_is_refused(tmp_path: Path) -> None:
@@ -597,16 +659,31 @@ def test_a_file_cut_short_or_of_another_kind_is_refused(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="digest is wrong"):
             load(path, "weights")
     path.write_bytes(whole)
-    with pytest.raises(ValueError, match="holds weights, needed: checkpoint"):
+    with pytest.raises(ValueError, match="holds something else than checkpoint"):
         load(path, "checkpoint")
     for content in (b"", b"text", b"PK\x03\x04 a broken archive"):
         path.write_bytes(digest(content))
         with pytest.raises(ValueError, match=r"cannot be read|digest is wrong"):
             load(path, "weights")
-    with pytest.raises(ValueError, match="cannot be read"):
-        load(tmp_path / "missing.pt", "weights")
-    with pytest.raises(ValueError, match="cannot be read"):
-        load(tmp_path, "weights")
+    os.mkfifo(tmp_path / "pipe")
+    with (tmp_path / "huge").open("wb") as file:
+        file.truncate(2**31)
+    for path in (tmp_path / "missing.pt", tmp_path, tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(ValueError, match="is no file of weights"):
+            load(path, "weights")
+    with pytest.raises(ValueError, match="is no file of weights"):
+        load(tmp_path / "huge", "weights")
+
+
+def test_an_archive_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
+    archive, path = io.BytesIO(), tmp_path / "w.pt"
+    with ZipFile(archive, "w", ZIP_DEFLATED) as file, file.open("a/data.pkl", "w") as part:
+        for _ in range(1100):
+            part.write(bytes(2**20))
+    path.write_bytes(digest(archive.getvalue()))
+    assert path.stat().st_size < 2e6
+    with pytest.raises(ValueError, match="larger inside"):
+        load(path, "weights")
 
 
 def test_a_malicious_pickle_is_refused_and_its_payload_not_run(tmp_path: Path) -> None:
@@ -627,12 +704,12 @@ def test_a_malicious_pickle_is_refused_and_its_payload_not_run(tmp_path: Path) -
 
 def test_when_the_disk_is_full_the_old_file_stays(tmp_path: Path) -> None:
     path = tmp_path / "w.pt"
-    write_whole(path, b"old")
+    path.write_bytes(b"old")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))  # no file may grow beyond
     try:
-        with pytest.raises(OSError, match="too large"):
-            write_whole(path, bytes(20_000))
+        with pytest.raises(OSError, match="too large"), whole_file(path) as file:
+            file.write(bytes(20_000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == b"old"

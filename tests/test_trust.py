@@ -5,7 +5,9 @@ moments, runs by `python -m pytest -m long`.
 """
 
 import hashlib
+import io
 import json
+import math
 import os
 import pickle
 import resource
@@ -14,6 +16,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -28,7 +31,7 @@ import torch
 
 import deepflight
 from deepflight import configure, train
-from dqn import QNetwork, Replay, load, lock_folder, save, save_weights
+from dqn import QNetwork, Replay, load, load_weights, lock_folder, save, save_weights
 from env import Fleet, ForestEnv, World
 
 CHECKPOINT = "checkpoint.pt"
@@ -44,13 +47,16 @@ FLAGS = [x for key, value in SMALL.items() for x in (f"--{key.replace('_', '-')}
 def start(*words: object, folder: Path, **how: object) -> subprocess.Popen:
     """Start the real command line in a folder of its own."""
     line = [sys.executable, "-u", str(ROOT / "deepflight.py"), *map(str, words)]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(line, cwd=folder, stdout=pipe, stderr=pipe, text=True, **how)
+    how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | how
+    for number in deepflight.STOPS:  # what the tests ignore, as under nohup, a child would too
+        if signal.getsignal(number) == signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
+    return subprocess.Popen(line, cwd=folder, **how)
 
 
 def flies(process: subprocess.Popen) -> bool:
     """Wait until a training prints its table's head, and with it takes off."""
-    return any("steps/s" in line for line in process.stdout)
+    return any("step  eps" in line for line in process.stdout)
 
 
 def finish(*words: object, folder: Path, **how: object) -> tuple[int, str, str]:
@@ -80,7 +86,6 @@ def train_with_cuts(folder: Path, cuts: set[int], **changed: object) -> deepflig
     c, r = configure(SMALL | changed)
     for _ in range(len(cuts) + 1):
         train(c, r, folder, saved)
-        Watched.runs[-1].lock.close()
         saved = load(folder / CHECKPOINT, "checkpoint")
     return Watched.runs[-1]
 
@@ -90,10 +95,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Trainings in this process are watched, and test points are two forests."""
     monkeypatch.setattr(deepflight, "Run", Watched)
     monkeypatch.setattr(deepflight, "TESTS", range(10**9, 10**9 + 2))
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
     Watched.runs.clear()
     Watched.cuts = set()
 
@@ -148,12 +150,11 @@ def test_a_truncated_flight_comes_back_with_its_last_frame(
     tmp_path: Path, watched: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(deepflight, "World", partial(World, max_steps=3))
-    c, r = configure(SMALL | {"steps": 160})
+    c, r = configure(SMALL | {"learning_starts": 80, "steps": 160})
     train(c, r, tmp_path)
     kept = Watched.runs[-1].replay.last_frames
-    Watched.runs[-1].lock.close()
     assert kept
-    c, r = configure(SMALL | {"steps": 168})
+    c, r = configure(SMALL | {"learning_starts": 80, "steps": 168})
     train(c, r, tmp_path, load(tmp_path / CHECKPOINT, "checkpoint"))
     restored = Watched.runs[-1].replay.last_frames
     assert kept.keys() <= restored.keys()
@@ -180,24 +181,54 @@ def test_ctrl_c_saves_and_prints_the_command_that_goes_on(
     process = start("train", *FLAGS, "--name", "small", folder=tmp_path)
     flies(process)
     process.send_signal(signal.SIGINT)
-    out, error = process.communicate()
-    assert (process.returncode, error) == (130, "")
+    _, error = process.communicate()
+    assert process.returncode == 130
     step = load(tmp_path / "runs/small" / CHECKPOINT, "checkpoint")["book"]["step"]
     assert step < SMALL["steps"]
-    saved, command = out.splitlines()[-2:]
+    _, stopping, saved, command = error.splitlines()
+    assert stopping == "stopping: this step ends and is saved; once more stops at once"
     assert saved == f"saved at step {step}; to go on:"
-    done = subprocess.run(shlex.split(command), cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(shlex.split(command), cwd="/", capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert_same_training(uninterrupted, tmp_path / "runs/small")
 
 
-def test_sigterm_saves_too(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_kill_and_a_closed_terminal_save_too(number: signal.Signals, tmp_path: Path) -> None:
     process = start("train", *FLAGS, "--steps", 10**6, "--name", "small", folder=tmp_path)
     flies(process)
-    process.terminate()
-    out, error = process.communicate()
-    assert (process.returncode, error) == (143, "")
-    assert "to go on:" in out
+    process.send_signal(number)
+    _, error = process.communicate()
+    assert process.returncode == 128 + number
+    assert "to go on:" in error
+
+
+def test_a_training_that_nobody_reads_goes_on_and_saves(tmp_path: Path) -> None:
+    process = start("train", *FLAGS, "--name", "small", folder=tmp_path)
+    flies(process)
+    process.stdout.close()  # as `train | head` does
+    assert (process.stderr.read(), process.wait()) == ("", 0)
+    step = load(tmp_path / "runs/small" / CHECKPOINT, "checkpoint")["book"]["step"]
+    assert step == SMALL["steps"]
+    line = [sys.executable, str(ROOT / "deepflight.py"), "train", *FLAGS, "--name", "closed"]
+    done = subprocess.run(["sh", "-c", f"exec {shlex.join(line)} >&-"], cwd=tmp_path, check=False)
+    assert done.returncode == 0
+    assert (tmp_path / "runs/closed/best.pt").exists()
+
+
+def test_signals_are_given_back_and_a_thread_trains_without_them(
+    tmp_path: Path, watched: None
+) -> None:
+    c, r = configure(SMALL)
+    handlers = [signal.getsignal(number) for number in deepflight.STOPS]
+    codes: list[int] = []
+    worker = threading.Thread(target=lambda: codes.append(train(c, r, tmp_path / "a")))
+    worker.start()
+    worker.join()
+    Watched.cuts = {400}
+    codes.append(train(c, r, tmp_path / "b"))
+    assert codes == [0, 130]
+    assert handlers == [signal.getsignal(number) for number in deepflight.STOPS]
 
 
 def test_a_second_ctrl_c_stops_at_once_and_the_checkpoint_stays_whole(tmp_path: Path) -> None:
@@ -209,7 +240,7 @@ def test_a_second_ctrl_c_stops_at_once_and_the_checkpoint_stays_whole(tmp_path: 
             process.wait(0.05)
     _, error = process.communicate()
     assert process.returncode == 130
-    assert error in ("\ninterrupted\n", "")
+    assert error.splitlines()[-1].endswith("runs/small"), "the command that goes on"
     assert load(tmp_path / "runs/small" / CHECKPOINT, "checkpoint")["book"]["step"] in (0, 8)
 
 
@@ -271,7 +302,7 @@ def test_a_checkpoint_of_another_torch_or_other_flights_is_refused(
     (seed, actions), *later = whole["flights"][0]
     for changed, named in (
         ({"machine": whole["machine"] | {"torch": "1.0"}}, "is of {'torch': '1.0'"),
-        ({"flights": [[(seed + 1, actions), *later], *whole["flights"][1:]]}, "fly otherwise"),
+        ({"flights": [[(seed + 1, actions), *later], *whole["flights"][1:]]}, "flown again here"),
     ):
         save(tmp_path / CHECKPOINT, "checkpoint", whole | changed)
         assert deepflight.main(["train", "--resume", str(tmp_path)]) == 2
@@ -284,29 +315,37 @@ def test_a_folder_in_use_is_refused_until_its_owner_is_gone(
     uninterrupted: Path,
 ) -> None:
     hold = "import dqn, pathlib, sys; x = dqn.lock_folder(pathlib.Path(sys.argv[1]))"
-    hold += "; print('held', flush=True); sys.stdin.read()"
+    hold += "; x.__enter__(); print('held', flush=True); sys.stdin.read()"
     line, pipe = [sys.executable, "-c", hold, str(uninterrupted)], subprocess.PIPE
     with subprocess.Popen(line, cwd=ROOT, stdin=pipe, stdout=pipe, text=True) as owner:
         assert owner.stdout.readline() == "held\n"
-        with pytest.raises(ValueError, match="another training's"):
-            lock_folder(uninterrupted)
+        with pytest.raises(ValueError, match="another training's"), lock_folder(uninterrupted):
+            pass
         owner.kill()
-    lock_folder(uninterrupted).close()  # a dead owner's lock is none
+    with lock_folder(uninterrupted):  # a dead owner's lock is none
+        pass
 
 
-def test_a_full_disk_is_one_line_and_the_old_checkpoint_stays(tmp_path: Path) -> None:
+@pytest.mark.parametrize("room", [-100, -1_000_000])
+def test_a_full_disk_is_one_line_and_the_old_checkpoint_stays(
+    room: int, uninterrupted: Path, tmp_path: Path
+) -> None:
+    limit = (uninterrupted / CHECKPOINT).stat().st_size + room  # the first one is a little smaller
+
     def no_large_files() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (30_000_000, 30_000_000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    # The optimizer's state makes the first full checkpoint larger than the empty one.
     words = ("train", *FLAGS, "--name", "small")
     code, _, error = finish(*words, folder=tmp_path, preexec_fn=no_large_files)
     assert code == 1
     assert error.count("\n") == 1
     assert "too large" in error
     folder = tmp_path / "runs/small"
-    assert load(folder / CHECKPOINT, "checkpoint")["book"]["step"] < SMALL["steps"]
-    assert not list(folder.glob("*.part"))
+    assert not list(tmp_path.rglob("*.part"))
+    if room == -100:
+        assert load(folder / CHECKPOINT, "checkpoint")["book"]["step"] < SMALL["steps"]
+    else:
+        assert not folder.exists(), "where nothing could be saved, nothing is left"
 
 
 def test_a_loss_that_is_no_number_stops_the_run_and_names_the_cause(
@@ -351,6 +390,88 @@ def test_a_malicious_checkpoint_runs_nothing(
         pickle.loads(pickle.dumps([Payload(), Payload()]))  # where pickle is trusted it runs
 
 
+# -------------------------------------------------- what an attacker signs
+
+
+def odd_thing(rng: np.random.Generator) -> object:
+    """Something that no file of ours holds where it will stand."""
+    size = rng.integers(0, 4, size=rng.integers(0, 4)).tolist()
+    things = [
+        *(None, True, -1, 2**200, 0.5, math.nan, math.inf, "x", b"x", [], {}, (), [[[]]], {1: "x"}),
+        *(torch.zeros(size), torch.full(size, math.nan), torch.zeros(3136, 512).to_sparse()),
+        *(torch.zeros(size, dtype=x) for x in (torch.int8, torch.float16, torch.complex64)),
+        torch.zeros(1).expand(512, 3136),
+    ]
+    return things[rng.integers(len(things))]
+
+
+def spoil(thing: object, rng: np.random.Generator) -> object:
+    """The same thing, one place in it changed, dropped or added, at any depth."""
+    if not isinstance(thing, dict | list | tuple) or not thing or rng.random() < 0.1:
+        return odd_thing(rng)
+    pairs = dict(thing if isinstance(thing, dict) else enumerate(thing))
+    key, way = list(pairs)[rng.integers(len(pairs))], rng.random()
+    if way < 0.1:
+        del pairs[key]
+    elif way < 0.2:
+        pairs["odd"] = odd_thing(rng)
+    else:
+        pairs[key] = spoil(pairs[key], rng)
+    return pairs if isinstance(thing, dict) else type(thing)(pairs.values())
+
+
+def weights_are_refused_or_the_same(path: Path, q: QNetwork, trials: int) -> None:
+    """Write spoilt weights; what is not refused in one line has every weight as it was."""
+    rng = np.random.default_rng(trials)
+    for _ in range(trials):
+        content = {"network": {k: x.half() for k, x in q.state_dict().items()}, "beacon": False}
+        content = spoil({"kind": "weights"} | content, rng)
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        path.write_bytes(buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
+        try:
+            read = load_weights(path, 9, beacon=False).state_dict()
+        except ValueError as error:
+            assert "\n" not in str(error)
+            continue
+        assert all(torch.equal(x.half().float(), read[k]) for k, x in q.state_dict().items())
+
+
+def checkpoints_are_refused_or_fly(
+    whole: Path, folder: Path, trials: int, capsys: pytest.CaptureFixture
+) -> None:
+    """Write spoilt checkpoints and go on with them: refused in one line, or flown to the end."""
+    rng, content = np.random.default_rng(trials), load(whole / CHECKPOINT, "checkpoint")
+    for _ in range(trials):
+        shutil.copytree(whole, folder, dirs_exist_ok=True)
+        spoilt = spoil(content, rng)
+        save(folder / CHECKPOINT, "checkpoint", spoilt if isinstance(spoilt, dict) else {})
+        before = {path: path.read_bytes() for path in folder.iterdir()}
+        code = deepflight.main(["train", "--resume", str(folder), "--steps", "808"])
+        error = capsys.readouterr().err
+        assert (code, error.count("\n")) in ((2, 1), (0, 0)), error
+        if code == 2:
+            assert before == {path: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("trials", [60, pytest.param(1500, marks=pytest.mark.long)])
+def test_signed_weights_of_whatever_content_are_refused_or_the_same(
+    trials: int, tmp_path: Path
+) -> None:
+    weights_are_refused_or_the_same(tmp_path / "w.pt", QNetwork(9), trials)
+
+
+@pytest.mark.parametrize("trials", [12, pytest.param(500, marks=pytest.mark.long)])
+def test_signed_checkpoints_of_whatever_content_are_refused_or_fly(
+    trials: int,
+    uninterrupted: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    watched: None,
+) -> None:
+    checkpoints_are_refused_or_fly(uninterrupted, tmp_path / "spoilt", trials, capsys)
+
+
 # -------------------------------------------------- the long half
 
 
@@ -393,7 +514,7 @@ def test_killed_at_thirty_random_moments_it_always_goes_on(tmp_path: Path) -> No
         except subprocess.TimeoutExpired:
             process.kill()
         process.communicate()
-        inside += path.with_name(path.name + ".part").exists()
+        inside += len(list(path.parent.glob(f".{path.name}.*.part")))
         step = load(path, "checkpoint")["book"]["step"]
         flown = int((path.parent / "log.csv").read_text().splitlines()[-1].split(",")[0])
         assert flown - step in (0, 16), "at most one interval is lost"
