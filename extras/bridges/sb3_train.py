@@ -9,20 +9,29 @@ of dqn.DQNConfig; the optimizer is Adam with our epsilon. What Stable-Baselines3
 the training goes without: Double DQN, mirroring, our additions to the reward, bfloat16, averaged
 weights, and the late change of Huber's delta. It keeps s and s2 whole, 56.4 kB a transition, so the
 replay here is 50,000 transitions, 2.8 GB, a quarter of ours.
+
+Every hundred flights it prints their mean return and length. Every 5,000 steps it flies 24 forests
+of the test range without random actions, and prints the same of them as `eval/`. The weights that
+it writes are the last ones. Ctrl-C writes those so far.
 """
 
-import argparse
+import shlex
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from stable_baselines3 import DQN
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from deepflight import RunConfig
-from dqn import DQNConfig, QNetwork, linear_schedule, save_weights
+from deepflight import Parser, RunConfig, configure, place
+from dqn import DQNConfig, QNetwork, check_output, linear_schedule, save_weights
+from env import say
 from extras.bridges.gym_env import Forest
 
 REPLAY = 50_000  # transitions
+TESTS = 24  # flights of a test
 ADAM_EPSILON = 1.5e-4  # that of dqn.make_optimizer
 NAMES = {  # theirs -> ours
     "features_extractor.cnn.": "conv.",
@@ -31,12 +40,16 @@ NAMES = {  # theirs -> ours
 }
 
 
+def make_envs(c: DQNConfig, r: RunConfig, forests: str) -> VecMonitor:
+    """Drones side by side in "training" or "test" forests; a VecMonitor counts their returns."""
+    return VecMonitor(DummyVecEnv([lambda: Forest(forests=forests, beacon=r.beacon)] * c.num_envs))
+
+
 def make_model(c: DQNConfig, r: RunConfig, replay: int = REPLAY) -> DQN:
     """Stable-Baselines3's DQN with the settings of `c` and `r` as far as it knows them."""
-    envs = DummyVecEnv([lambda: Forest(beacon=r.beacon)] * c.num_envs)
     return DQN(
         "CnnPolicy",
-        envs,
+        make_envs(c, r, "training"),
         learning_rate=lambda left: linear_schedule(1 - left, c.lr, c.lr * c.lr_decay, 1),
         buffer_size=replay,
         learning_starts=c.learning_starts,
@@ -68,21 +81,56 @@ def convert(model: DQN) -> QNetwork:
     return q
 
 
-def main() -> None:
-    """Train, convert, save."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def make_test(c: DQNConfig, r: RunConfig) -> EvalCallback:
+    """Stable-Baselines3's own test: some flights through test forests every `test_every` steps."""
+    envs = make_envs(c, r, "test")
+    envs.seed(r.seed)
+    return EvalCallback(envs, n_eval_episodes=TESTS, eval_freq=r.test_every // c.num_envs)
+
+
+def train(c: DQNConfig, r: RunConfig, out: Path) -> int:
+    """Train, convert, save, even if Ctrl-C ends the training. Returns the exit code, 0 or 130."""
+    torch.set_num_threads(r.threads)
+    model, end, code = make_model(c, r), "", 0
+    try:
+        model.learn(c.steps, make_test(c, r), log_interval=100)
+    except KeyboardInterrupt:
+        end, code = f"\ninterrupted at step {model.num_timesteps:,}; ", 130
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_weights(out, convert(model), beacon=r.beacon)
+    fly = ["deepflight.py", "eval", *["--beacon"] * r.beacon, "--weights", str(out)]
+    say(f"{end}wrote {out}; fly it: python {shlex.join(fly)}")
+    return code
+
+
+def parse(argv: Sequence[str] | None) -> tuple[DQNConfig, RunConfig, Path]:
+    """Read and check the command line. Raises ValueError."""
+    parser = Parser(prog="sb3_train", description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=DQNConfig.steps, help="control steps in all")
     parser.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
-    parser.add_argument("--out", type=Path, default="runs/sb3.pt", help="the weights' file")
-    args = parser.parse_args()
-    c, r = DQNConfig(steps=args.steps), RunConfig(beacon=args.beacon)
-    torch.set_num_threads(r.threads)
-    model = make_model(c, r).learn(c.steps, log_interval=100)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    save_weights(args.out, convert(model), beacon=r.beacon)
-    beacon = " --beacon" if r.beacon else ""
-    print(f"wrote {args.out}; fly it: python deepflight.py eval{beacon} --weights {args.out}")
+    parser.add_argument("--out", type=place, default="runs/sb3.pt", help="the weights' file")
+    args = parser.parse_args(argv)
+    check_output(args.out, b"weights")
+    return *configure({"steps": args.steps, "beacon": args.beacon}), args.out
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Check all that is given, then train. Exit codes: 2 bad input, 1 trouble on the way, 130
+    Ctrl-C; each comes with one line."""
+    try:
+        settings = parse(argv)
+    except ValueError as error:
+        print(f"sb3_train: error: {error}", file=sys.stderr)
+        return 2
+    try:
+        return train(*settings)
+    except (MemoryError, FloatingPointError, OSError) as error:
+        print(f"sb3_train: error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("\ninterrupted; no weights are written", file=sys.stderr)
+        return 130
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

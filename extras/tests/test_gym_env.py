@@ -1,14 +1,13 @@
 """The Gymnasium environment passes both checkers and works with what people wrap around it."""
 
 import warnings
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
-from gymnasium.wrappers import RecordVideo, TimeLimit
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from env import ForestEnv
@@ -59,15 +58,6 @@ def test_three_in_a_vector_fly_as_three_alone(vector: type) -> None:
     envs.close()
 
 
-def test_a_flight_is_filmed(tmp_path: Path) -> None:
-    env = RecordVideo(gymnasium.make(ID, render_mode="rgb_array"), str(tmp_path / "film"))
-    env.reset(seed=1)
-    while not any(env.step(4)[2:4]):
-        pass
-    env.close()
-    assert next(tmp_path.glob("film/*.mp4")).stat().st_size > 1000
-
-
 def test_render_shows_the_frame_beside_the_map() -> None:
     env = gymnasium.make(ID, render_mode="rgb_array")
     observation, _ = env.reset(seed=1)
@@ -79,15 +69,92 @@ def test_render_shows_the_frame_beside_the_map() -> None:
     assert len(np.unique(picture[:, height:].reshape(-1, 3), axis=0)) > 3
 
 
-def test_a_time_limit_truncates() -> None:
-    env = TimeLimit(gymnasium.make(ID), 2)
+def test_every_action_of_the_space_means_what_the_int_means() -> None:
+    kinds = (int, np.array, np.int64, np.uint8)
+    for action in range(9):
+        envs = [gymnasium.make(ID) for _ in kinds]
+        for env in envs:
+            env.reset(seed=1)
+        steps = [env.step(kind(action)) for env, kind in zip(envs, kinds, strict=True)]
+        assert all(step[1:] == steps[0][1:] for step in steps)
+    with pytest.raises(ValueError, match="action is array"):
+        envs[0].unwrapped.step(np.array(9))
+
+
+def test_who_writes_into_an_observation_changes_no_other() -> None:
+    ours, theirs = Forest(), Forest()
+    for step in (lambda env: env.reset(seed=1), *[lambda env: env.step(4)] * 5):
+        seen = step(ours)[0]
+        assert np.array_equal(seen, step(theirs)[0])
+        seen[:] = 0
+
+
+def test_nothing_steps_or_renders_before_a_reset() -> None:
+    env = Forest(render_mode="rgb_array")
+    for call in (lambda: env.step(4), env.render):
+        with pytest.raises(ResetNeeded, match=r"^call reset before \w+$"):
+            call()
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "7", True, np.nan])
+def test_after_a_failed_reset_no_flight_is_in_the_air(seed: object) -> None:
+    env = gymnasium.make(ID, render_mode="rgb_array")
     env.reset(seed=1)
-    assert [env.step(4)[2:4] for _ in range(2)] == [(False, False), (False, True)]
+    with pytest.raises(ValueError, match=r"^seed is .*, allowed are whole numbers from 0$"):
+        env.reset(seed=seed)
+    for call in (lambda: env.step(4), env.render):
+        with pytest.raises(ResetNeeded):
+            call()
+    assert env.reset(seed=np.int64(2))[1]["forest"] == 2
+
+
+def test_a_test_environment_shares_no_forest_with_a_training_of_equal_seeds() -> None:
+    flown = {}
+    for forests in ("training", "test"):
+        env = gymnasium.make(ID, forests=forests)
+        seeds = [0, None, None, 7, None, 999_999_999, None]
+        flown[forests] = [env.reset(seed=seed)[1]["forest"] for seed in seeds]
+    assert all(0 <= forest < 10**9 for forest in flown["training"])
+    assert all(10**9 <= forest < 2 * 10**9 for forest in flown["test"])
+    assert len({*flown["training"]} | {*flown["test"]}) == 14
+
+
+def test_a_seed_of_a_test_environment_leads_into_its_range() -> None:
+    env, first = Forest(forests="test"), 10**9
+    pairs = {0: first, 7: first + 7, first + 5: first + 5, 2 * first - 1: 2 * first - 1}
+    for seed, forest in (pairs | {3 * first + 2: first + 2}).items():
+        observation, info = env.reset(seed=seed)
+        assert info["forest"] == forest
+        assert np.array_equal(observation, Forest().reset(seed=forest)[0])
+    with pytest.raises(ValueError, match="forests is 'eval', allowed: 'training', 'test'"):
+        Forest(forests="eval")
+
+
+def test_the_time_limit_is_the_worlds_and_a_longer_world_says_when_it_is_cut() -> None:
+    assert gymnasium.spec(ID).max_episode_steps == gymnasium.make(ID).spec.max_episode_steps == 1000
+    world = {"rows": 0, "back": 30.0}  # no trunk is in the way of a circle
+    for limits, end in (({}, (1000, "time")), ({"max_steps": 1003}, (1000, ""))):
+        env = gymnasium.make(ID, **world, **limits)
+        assert circle(env) == end
+    with pytest.warns(UserWarning, match="cut at step 1000: give max_episode_steps too"):
+        env.reset()
+    both = {"max_steps": 1003, "max_episode_steps": 1003}
+    assert circle(gymnasium.make(ID, **world, **both)) == (1003, "time")
+
+
+def circle(env: gymnasium.Env) -> tuple[int, str]:
+    """Turn left until the flight is truncated: its steps and its outcome."""
+    env.reset(seed=1)
+    for steps in range(1, 2000):
+        *_, truncated, info = env.step(8)
+        if truncated:
+            return steps, info["outcome"]
 
 
 def test_a_world_is_changed_by_keywords_and_an_impossible_one_refused() -> None:
     slow = gymnasium.make(ID, dt=0.05, actions=3)
     assert slow.action_space.n == 3 and slow.metadata["render_fps"] == 20
+    assert Forest(speed=0.4, dt=2.5).metadata["render_fps"] == 1
     with pytest.raises(ValueError, match="speed"):
         Forest(speed=-1.0)
     with pytest.raises(ValueError, match="render_mode is 'human'"):

@@ -5,7 +5,9 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from env import ForestEnv
 from extras.bridges.gym_env import ID, Forests
@@ -94,13 +96,70 @@ def test_a_seed_decides_all_forests_of_the_native_vector() -> None:
     assert len({*drawn[0]}) == 6 and max(drawn[0]) < 10**9
 
 
-def test_the_native_vector_renders_wants_a_reset_and_refuses_an_impossible_world() -> None:
+def test_the_native_vector_renders_and_refuses_an_impossible_world() -> None:
     envs = Forests(2, render_mode="rgb_array", dt=0.05)
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        envs.step(np.array([4, 4]))
     envs.reset(seed=3)
     envs.step(np.array([0, 8]))
     assert [picture.shape for picture in envs.render()] == [(232, 624, 3)] * 2
-    assert Forests(1).render() is None
+    envs = Forests(1)
+    envs.reset(seed=3)
+    assert envs.render() is None
     with pytest.raises(ValueError, match="speed"):
         Forests(2, speed=-1.0)
+    with pytest.raises(ValueError, match="forests is 'eval', allowed: 'training', 'test'"):
+        Forests(2, forests="eval")
+
+
+def refuses_to_fly(envs: Forests) -> None:
+    """Neither step nor render does anything before a reset."""
+    for call in (lambda: envs.step(np.array([4, 4])), envs.render):
+        with pytest.raises(ResetNeeded, match=r"^call reset before \w+$"):
+            call()
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "7", True, [1, -1], [1, 2.5], [1], [1, 2, 3]])
+def test_before_a_reset_and_after_a_failed_one_nothing_is_in_the_air(seed: object) -> None:
+    envs = Forests(2, render_mode="rgb_array")
+    refuses_to_fly(envs)
+    envs.reset(seed=1)
+    with pytest.raises(ValueError, match=r"^seed (is|has) .*, allowed are "):
+        envs.reset(seed=seed)
+    refuses_to_fly(envs)
+    assert envs.reset(seed=[np.int64(7), None])[1]["forest"][0] == 7
+
+
+@pytest.mark.parametrize("actions", [[4, 9], [4, -1], [4.0, 4.0], [4], [4, 4, 4], 4])
+def test_after_a_refused_action_no_drone_has_moved(actions: object) -> None:
+    envs = Forests(2)
+    envs.reset(seed=1)
+    with pytest.raises(ValueError, match="action"):
+        envs.step(np.array(actions))
+    assert np.all(envs.step(np.array([4, 4]))[4]["progress"] == 0.5)
+
+
+def test_equal_seeds_give_training_and_test_lanes_different_forests() -> None:
+    flown = {}
+    for forests in ("training", "test"):
+        envs = gymnasium.make_vec(ID, num_envs=3, forests=forests, max_steps=1)
+        seen = [envs.reset(seed=seed)[1]["forest"] for seed in (0, None, [7, None, 9])]
+        envs.step(np.full(3, 4))
+        flown[forests] = np.concatenate([*seen, envs.step(np.full(3, 4))[4]["forest"]])
+    assert list(flown["test"][[0, 1, 2, 6, 8]]) == [10**9 + k for k in (0, 1, 2, 7, 9)]
+    assert np.all(flown["training"] < 10**9)
+    assert np.all((flown["test"] >= 10**9) & (flown["test"] < 2 * 10**9))
+
+
+def test_the_native_vector_takes_gymnasiums_time_limit_or_the_worlds() -> None:
+    for limits, end in (({}, 1000), ({"max_episode_steps": 2}, 2), ({"max_steps": 2000}, 2000)):
+        envs = gymnasium.make_vec(ID, num_envs=2, **limits)
+        assert envs.fleet.world.max_steps == end
+    assert gymnasium.make_vec(ID, num_envs=2).spec.max_episode_steps == 1000
+
+
+def test_the_statistics_of_a_vector_are_the_sums_of_its_rewards() -> None:
+    envs, total = RecordEpisodeStatistics(Forests(2, max_steps=3)), np.zeros(2)
+    envs.reset(seed=1)
+    for _ in range(3):
+        _, rewards, *_, infos = envs.step(np.array([4, 4]))
+        total += rewards
+    assert np.allclose(infos["episode"]["r"], total) and list(infos["episode"]["l"]) == [3, 3]
