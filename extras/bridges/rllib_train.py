@@ -2,7 +2,7 @@
 
     extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.bridges.rllib_train --runners 2 --steps 100000  # a Ray here
-    extras/.venv/bin/python -m extras.bridges.rllib_train --runners 64 --address auto  # join others
+    extras/.venv/bin/python -m extras.bridges.rllib_train --runners 64 --address HOST:6379  # join
     extras/.venv/bin/python deepflight.py eval --weights runs/rllib.pt
 
 The network is dqn.QNetwork itself, inside RLlib's current API stack: its convolutions are the
@@ -10,20 +10,35 @@ encoder, its head the Q-function, so the trained weights are ours as they are. S
 of dqn.DQNConfig; RLlib has no mirroring, additions to the reward, averaged weights, bfloat16 or
 late Huber delta.
 
-On a real cluster, which we have not tried: start Ray on every machine (`ray start --head` on one,
-`ray start --address HOST:6379` on the others), with this Python and these packages on each; the
-code travels from here. Runners share the flying, which is cheap. Learning stays in one process, a
-batch of 32 every 4 steps however many runners there are, and is the limit at once: two runners on
-two cores flew 790 steps a second while nothing learned and 80 once it did. What helps then is a GPU
-for the learner (`.learners(num_learners=1, num_gpus_per_learner=1)`), larger batches, or many seeds
-at once. The replay of 50,000 transitions lies in this machine's memory; Ray logs to ~/ray_results.
+Runners share the flying, which is cheap. Learning stays in one process, a batch of 32 every 4 steps
+however many runners there are, and is the limit at once. What helps then is a GPU for the learner
+(`.learners(num_learners=1, num_gpus_per_learner=1)`), larger batches, or many seeds at once. The
+replay of 50,000 transitions lies in this machine's memory; Ray logs to ~/ray_results.
+
+At the end the script prints how many steps a second each node added. If a node dies, the others fly
+on, and its runners start again where a CPU is free. The node of this script must live: it holds the
+learner and the replay. We tried three nodes that `ray.cluster_utils.Cluster` made on one machine,
+and killed one midway: extras/experiments/nodes.py does this, and results/nodes.json has what each
+node flew. They shared two cores, so they say little of what machines add.
+
+We did not try a cluster of several machines. There, start Ray on every machine (`ray start --head`
+on one, `ray start --address HOST:6379` on the others), with this Python and these packages on each,
+and run the script on one of them; the code travels from here.
 """
 
 import argparse
+import logging
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import ray
+from ray.exceptions import RayError
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.dqn import DQNConfig as RayConfig
 from ray.rllib.algorithms.dqn.default_dqn_rl_module import QF_PREDS
@@ -34,14 +49,17 @@ from ray.rllib.utils.schedules.scheduler import Scheduler
 from ray.tune.registry import register_env
 from torch import Tensor, nn
 
-from deepflight import RunConfig
-from dqn import DQNConfig, QNetwork, save_weights
+from deepflight import Parser, RunConfig, place
+from dqn import DQNConfig, QNetwork, check_output, save_weights
 from extras.bridges.gym_env import ID, Forest
 
 ROOT = Path(__file__).parents[2]
 ENVS = 4  # forests a runner flies at once
 REPLAY = 50_000  # transitions, 28 kB each
 ADAM_EPSILON = 1.5e-4  # that of dqn.make_optimizer
+PROBE = 0.05  # s to wait, before each batch, for a lost runner that may be back
+MOST_STEPS, MOST_RUNNERS = 10**9, 10_000
+ANSWER = 20  # s within which a Ray must answer
 
 
 class Nature(DefaultDQNTorchRLModule):
@@ -60,6 +78,12 @@ class Nature(DefaultDQNTorchRLModule):
         return {QF_PREDS: head(encoder(batch[Columns.OBS].float() / 255))}  # (B, actions)
 
 
+def count(env_runner: Any, metrics_logger: Any, samples: Sequence[Any], **_: Any) -> None:
+    """Count the steps of a sample under the node on which the runner lives; RLlib calls this."""
+    key = ("nodes", ray.get_runtime_context().get_node_id(), str(env_runner.worker_index))
+    metrics_logger.log_value(key, sum(map(len, samples)), reduce="lifetime_sum")
+
+
 def make_config(c: DQNConfig, r: RunConfig, runners: int) -> RayConfig:
     """RLlib's DQN with the settings of `c` and `r` as far as it knows them."""
     replay = {"type": "EpisodeReplayBuffer", "capacity": REPLAY}
@@ -72,6 +96,9 @@ def make_config(c: DQNConfig, r: RunConfig, runners: int) -> RayConfig:
         .env_runners(
             num_env_runners=runners, num_envs_per_env_runner=ENVS, rollout_fragment_length=c.n_steps
         )
+        .callbacks(on_sample_end=count)
+        # A lost runner starts again where a CPU is free; until then the others fly on.
+        .fault_tolerance(restart_failed_env_runners=True, env_runner_health_probe_timeout_s=PROBE)
         .rl_module(rl_module_spec=RLModuleSpec(module_class=Nature))
         .training(
             lr=[[0, c.lr], [c.steps, c.lr * c.lr_decay]],
@@ -108,45 +135,100 @@ def train(c: DQNConfig, r: RunConfig, runners: int, out: Path) -> None:
     """Train for c.steps, with a line each thousand steps or so, and write the weights."""
     register_env(ID, lambda _context: Forest(beacon=r.beacon))
     algorithm, steps = make_config(c, r, runners).build_algo(), 0
+    nodes: dict[str, dict[str, float]] = {}  # steps of each runner on each node
+    busy: Counter[str] = Counter()  # s in which each node flew
     while steps < c.steps:
         result = algorithm.train()
-        flown, seconds = result["env_runners"], result["time_total_s"]
+        flown, seconds, before = result["env_runners"], result["time_total_s"], nodes
+        nodes = {node: dict(each) for node, each in flown["nodes"].items()}
+        live = [node for node in nodes if nodes[node] != before.get(node)]
+        busy.update(dict.fromkeys(live, result["time_this_iter_s"]))
         steps = int(flown["num_env_steps_sampled_lifetime"])
-        left = (c.steps - steps) * seconds / steps / 60
+        left = max(c.steps - steps, 0) * seconds / steps / 60
         text = f"{steps:9,} steps, {steps / seconds:5.0f} a second, {left:5.1f} min left"
+        text += f", {algorithm.env_runner_group.num_healthy_remote_env_runners()} runners"
         print(f"{text}, flights of {flown.get('episode_len_mean', 0):.1f} steps", flush=True)
+    report(nodes, busy, live)
     out.parent.mkdir(parents=True, exist_ok=True)
     save_weights(out, network(algorithm), beacon=r.beacon)
     algorithm.stop()
     print(f"wrote {out}; fly it: deepflight.py eval{' --beacon' * r.beacon} --weights {out}")
 
 
-def start(address: str | None) -> None:
+def report(nodes: dict[str, dict[str, float]], busy: Counter[str], live: list[str]) -> None:
+    """Print what each node added while it flew."""
+    address = {node["NodeID"]: node["NodeManagerAddress"] for node in ray.nodes()}
+    for node, runners in nodes.items():
+        steps, lost = sum(runners.values()), "" if node in live else ", lost on the way"
+        text = f"node {address[node]} {node[:8]}: {steps:,.0f} steps, "
+        print(f"{text}{steps / busy[node]:.0f} a second, runners: {len(runners)}{lost}", flush=True)
+
+
+def knock(address: str) -> None:
+    """Raise ConnectionError if no Ray of this version answers there.
+
+    A process of its own asks, because ray.init would print warnings for minutes.
+    """
+    ask = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--address", address]
+    try:
+        subprocess.run(ask, check=True, capture_output=True, timeout=ANSWER)
+    except subprocess.SubprocessError:
+        raise ConnectionError(f"no Ray of version {ray.__version__} answers at {address}") from None
+
+
+def start(address: str | None, runners: int) -> None:
     """Join the Ray at this address, or start one here; every runner gets the code."""
+    if address:
+        knock(address)
     code = {"working_dir": str(ROOT), "excludes": [".venv", "runs", "results", "figures"]}
     ray.init(
-        address=address or "local", runtime_env=code, include_dashboard=False, log_to_driver=False
+        address=address or "local",
+        num_cpus=None if address else runners,
+        runtime_env=code,
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level=logging.ERROR,
     )
+    if runners > (free := int(ray.available_resources().get("CPU", 0))):
+        raise ValueError(f"runners is {runners}, allowed here: 1 to {free}, one a free CPU")
 
 
-def main() -> None:
-    """Join or start a Ray, train, and stop it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runners", type=int, default=2, help="processes that fly")
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Read and check the command line. Raises ValueError."""
+    parser = Parser(prog="rllib_train", description=__doc__.splitlines()[0])
+    parser.add_argument("--runners", type=int, default=2, help="processes that fly, one a CPU")
     parser.add_argument("--steps", type=int, default=DQNConfig.steps, help="control steps in all")
     parser.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
     parser.add_argument("--address", help="of a running Ray; else one is started here")
-    parser.add_argument("--out", type=Path, default="runs/rllib.pt", help="the weights' file")
-    args = parser.parse_args()
-    if args.runners < 1:
-        parser.error(f"runners is {args.runners}, allowed: 1 or more")
-    start(args.address)
+    parser.add_argument("--out", type=place, default="runs/rllib.pt", help="the weights' file")
+    args = parser.parse_args(argv)
+    if args.address is not None and not re.fullmatch(r"auto|[^/\s]+:\d{1,5}", args.address):
+        raise ValueError(f"address is {args.address!r}, allowed: auto or HOST:PORT")
+    most = MOST_RUNNERS if args.address else os.cpu_count()
+    for name, value, high in (("steps", args.steps, MOST_STEPS), ("runners", args.runners, most)):
+        if not 1 <= value <= high:
+            raise ValueError(f"{name} is {value}, allowed here: whole numbers from 1 to {high:,}")
+    check_output(args.out, b"weights")
+    return args
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Check all that is given, join or start a Ray, and train. Exit codes: 2 bad input, 1 trouble
+    on the way, 130 Ctrl-C; each comes with one line."""
     try:
-        c, r = DQNConfig(steps=args.steps), RunConfig(beacon=args.beacon)
-        train(c, r, args.runners, args.out)
+        args = parse(argv)
+        start(args.address, args.runners)
+        train(DQNConfig(steps=args.steps), RunConfig(beacon=args.beacon), args.runners, args.out)
+    except (ValueError, RuntimeError, FloatingPointError, OSError, RayError) as error:
+        print(f"rllib_train: error: {str(error).strip().splitlines()[-1]}", file=sys.stderr)
+        return 2 if isinstance(error, ValueError) else 1
+    except KeyboardInterrupt:
+        print("\ninterrupted; no weights are written", file=sys.stderr)
+        return 130
     finally:
         ray.shutdown()
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
