@@ -304,7 +304,7 @@ def print_table(figures: dict[str, dict]) -> None:
     for some in (list(figures)[i : i + room] for i in range(0, len(figures), room)):
         say(f"{'':12}" + "".join(f"{name:>17}" for name in some))
         for key, (label, factor) in ROWS.items():
-            cells = [[f"{factor * x:.0f}" for x in figures[p][key].values()] for p in some]
+            cells = [[f"{factor * x:z.0f}" for x in figures[p][key].values()] for p in some]
             texts = [f"{x} [{', '.join(ends)}]" if ends else x for x, *ends in cells]
             say(f"{label:12}" + "".join(f"{text:>17}" for text in texts))
 
@@ -322,7 +322,7 @@ def film(flown: dict[str, dict], world: World, q: QNetwork) -> Iterator[render.I
         action, ended = (int(flight["actions"][t]), "") if t < flight["steps"] else (-1, end)
         if t % (1 + flight["steps"] // 300) and not ended:
             continue  # of a long flight not every step is filmed
-        seen = render.draw_ways(chart, [(path[: t + 1], ended, name)])
+        seen = render.draw_ways(chart, [(path[: t + 1], ended, "")])
         values = q(torch.from_numpy(s)[None])[0].numpy() if name == "dqn" else None  # (A,)
         clock = f"{t * world.dt:.1f} s, {info['d_goal']:.1f} m to the goal"
         lines = (f"{name}: {clock}", f"reward so far {total:.1f}", render.ENDS[ended])
@@ -341,7 +341,7 @@ def track(flight: dict[str, Any], world: World) -> tuple[ndarray, str]:
 
 HEAD = "     step  eps    /s left reward |  test longer cross crash"
 ROW = "{step:9,}{epsilon:5.2f}{speed:6.0f}{eta:5.0f}{train_return:7.1f} |{test_return:6.1f}"
-ROW += "{test_over_random:7.0%}{test_crossed:6.0%}{test_crash:6.0%}"
+ROW += "{test_over_random:z7.0%}{test_crossed:6.0%}{test_crash:6.0%}"
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, kill, a closed terminal
 
 
@@ -520,14 +520,10 @@ def place(text: str) -> Path:
 
 def describe(f: Field) -> str:
     """The help of a setting's flag: what it is, what is allowed, what the presets make of it."""
-    low, high = f.metadata["legal"]
-    notes = [
-        "true or false" if f.type is bool else f"{low:,g} to {high:,g}",
-        f"default {f.default}",
-    ]
-    for name, preset in (("mnih", MNIH), ("beacon", BEACON)):
-        notes += [f"{name} {preset[f.name]}"] if f.name in preset else []
-    return f"{f.metadata['help']} ({'; '.join(notes)})"
+    legal = "{:,g} to {:,g}".format(*f.metadata["legal"]) if f.type is not bool else "true or false"
+    presets = (("mnih", MNIH), ("beacon", BEACON))
+    changes = [f"; {name} {preset[f.name]}" for name, preset in presets if f.name in preset]
+    return f"{f.metadata['help']} ({legal}; default {f.default}{''.join(changes)})"
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -555,7 +551,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     sub.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
     sub.add_argument("--json", type=place, metavar="FILE", help="write every figure and flight")
     sub.add_argument("--out", type=place, default="runs/eval", help="folder of the film")
-    sub.add_argument("--threads", **more, help="of the CPU; default: OMP_NUM_THREADS or 2")
+    known = "OMP_NUM_THREADS" in os.environ  # torch has read it
+    threads = torch.get_num_threads() if known else RunConfig.threads
+    sub.add_argument("--threads", **more, default=threads, help="default: OMP_NUM_THREADS or 2")
     return parser.parse_args(argv)
 
 
@@ -622,9 +620,6 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
 
 def load_pilot(args: argparse.Namespace) -> QNetwork:
     """Check all that is given before anything flies, and read the weights. Raises ValueError."""
-    if args.threads is None:  # torch has read OMP_NUM_THREADS
-        known = "OMP_NUM_THREADS" in os.environ
-        args.threads = torch.get_num_threads() if known else RunConfig.threads
     for name, low, high in (
         ("episodes", 1, 10**6), ("first_seed", 0, 10**18), ("threads", 1, 256)
     ):  # fmt: skip

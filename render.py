@@ -229,15 +229,19 @@ def draw_map(trunks: ndarray, size: Point, title: str = "") -> Image.Image:
 
 def draw_ways(image: Image.Image, ways: Iterable[tuple[ndarray, str, str]]) -> Image.Image:
     """Draw flights onto a copy of a map: path (T, 2) in m, how it ended or "", label, each."""
-    image = image.copy()
+    image, labels = image.copy(), []
     draw = ImageDraw.Draw(image)
-    for i, (path, ended, label) in enumerate(ways):
+    for path, ended, label in ways:
         colour = COLOURS.get(ended, "#ff7f0e")
         draw.line([pixel(image, x, y) for x, y in path], fill=colour, width=3)
         disc(image, *path[-1], 0.7, colour)
-        at = pixel(image, path[-1][0], path[-1][1] + 3 - 2 * i)
-        side = "rm" if at[0] > 0.8 * image.width else "lm"
-        draw.text(at, f" {label} ", fill=colour, font_size=18, anchor=side)
+        x, y = pixel(image, *path[-1])
+        step = 18 if y < image.height / 2 else -18  # px: towards the middle until there is room
+        while any(abs(x - u) < 110 and abs(y + step - v) < 18 for u, v in labels):
+            y += step
+        labels.append((x, y + step))
+        side = "rm" if x > 0.8 * image.width else "lm"
+        draw.text(labels[-1], f" {label} ", fill=colour, font_size=18, anchor=side)
     return image
 
 

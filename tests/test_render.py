@@ -244,6 +244,20 @@ def bars(panel: Image.Image, actions: int = 9) -> list[tuple[tuple, int]]:
     return [(tuple(c[-1].tolist()), int((c == c[-1]).all(1).sum())) for c in columns]
 
 
+@pytest.mark.parametrize("end", [(0.0, 25.0), (90.0, 25.0), (90.0, -25.0), (45.0, 0.0)])
+def test_labels_of_flights_that_end_at_one_place_are_whole_wherever_that_is(end: Point) -> None:
+    chart, path = draw_map(np.empty((0, 2)), (90, 50)), np.array([end])
+
+    def ink(way: np.ndarray, labels: list[str]) -> int:
+        named = draw_ways(chart, [(way, "crash", label) for label in labels])
+        bare = draw_ways(chart, [(way, "crash", "") for _ in labels])
+        return int((np.asarray(named) != np.asarray(bare)).any(-1).sum())
+
+    labels = ["random", "straight", "laser"]
+    alone = sum(ink(np.array([(45.0, 0.0)]), [label]) for label in labels)
+    assert ink(path, labels) == pytest.approx(alone, rel=0.02)  # a few pixels lie on a border line
+
+
 def test_the_chosen_bar_is_red_and_the_tallest_is_the_best_action() -> None:
     rng, frame, chart = np.random.default_rng(5), np.zeros((84, 84), np.uint8), blank()
     for _ in range(20):

@@ -32,7 +32,8 @@ PANELS = {  # column of log.csv -> title
     "test_return": "Figure 3: total reward on the test forests",
     "test_steps": "Figure 4: flight time on the test forests, steps",
 }
-LABELS = {"paper": "the paper's world", "beacon": "with the beacon"}  # folder -> label
+# folder -> label, and the colour that the recipe has in every picture
+LABELS = {"paper": ("the paper's world", "C0"), "beacon": ("with the beacon", "C1")}
 Log = dict[str, np.ndarray]  # the columns of a log.csv (T,)
 
 
@@ -70,11 +71,13 @@ def draw_learning() -> None:
     figure, panels = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
     for axes, (column, title) in zip(panels, PANELS.items(), strict=True):
         for name, log in logs.items():
-            axes.plot(log["step"], log[column], label=LABELS.get(name, name), linewidth=1.2)
+            label, colour = LABELS[name]
+            axes.plot(log["step"], log[column], colour, label=label, linewidth=1.2)
         levels(axes, column, next(iter(logs.values())))
         axes.set_title(title, fontsize=11)
         axes.set(xlabel="control steps", xscale="log")
-    panels[-1].legend(fontsize=9)
+    handles, labels = panels[-1].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=9, ncols=len(labels), loc="outside lower center")
     finish(figure, "learning.png")
 
 
@@ -83,13 +86,14 @@ def draw_crossed() -> None:
     figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
     log = read(ROOT / "results/paper/log.csv")
     share = np.convolve(100 * log["test_crossed"], np.ones(5) / 5, "valid")  # (T - 4,) %
-    axes.plot(log["step"][4:], share, label="the camera pilot in training", linewidth=1.2)
+    colour = LABELS["paper"][1]
+    axes.plot(log["step"][4:], share, colour, label="the camera pilot in training", linewidth=1.2)
     laser = json.loads((ROOT / "results/compass.json").read_text())
     for way, line in (("straight on", ":"), ("by compass", "--")):
         y = laser[f"the laser pilot, {way}: crossed, %"]
         axes.axhline(y, color="black", linestyle=line, label=f"the laser pilot, {way}")
     axes.set(title="Crossed in the paper's world, %", xlabel="control steps", ylim=(0, 100))
-    axes.legend(fontsize=9, loc="lower right")
+    figure.legend(fontsize=9, ncols=3, loc="outside lower center")
     finish(figure, "crossed.png")
 
 
