@@ -590,6 +590,8 @@ def resume_training(folder: Path, given: dict[str, Any]) -> int:
     if not (folder / "checkpoint.pt").is_file():
         raise ValueError(f"{folder} holds no checkpoint.pt: give the folder of a training")
     with dqn.lock_folder(folder):
+        for part in folder.glob(".*.part"):  # of a save that was killed
+            part.unlink()
         for name in ("best.pt", "config.json", "log.csv"):
             dqn.check_output(folder / name, b"")
         saved = dqn.load(folder / "checkpoint.pt", "checkpoint")

@@ -373,14 +373,14 @@ class RMSprop(torch.optim.Optimizer):
 
     def __init__(self, theta: Any, lr: float) -> None:
         super().__init__(theta, {"lr": lr})
+        for w in self.param_groups[0]["params"]:
+            self.state[w] = {"mean": torch.zeros_like(w), "mean_square": torch.zeros_like(w)}
 
     @torch.no_grad()
     def step(self) -> None:
         """Move every weight once."""
-        for w in self.param_groups[0]["params"]:
-            if not self.state[w]:
-                self.state[w] = {"mean": torch.zeros_like(w), "mean_square": torch.zeros_like(w)}
-            mean, mean_square = self.state[w].values()
+        for w, means in self.state.items():
+            mean, mean_square = means.values()
             mean.lerp_(w.grad, 0.05)
             mean_square.lerp_(w.grad**2, 0.05)
             deviation = (mean_square - mean**2 + 0.01 / 32**2).sqrt()
