@@ -13,17 +13,18 @@ film and plumbing (files, signals, clocks, the command line) stand last. Skip th
 `train` prints a row at every test point:
 
          step  eps    /s left reward |  test longer cross crash
-       10,000 0.76   354   14  -20.7 |  19.9   353%   17%    6%
+       10,000 0.76   233   21  -20.7 |  19.9   353%   17%    6%
 
 The drones have flown 10,000 control steps, and 76 % of the actions are random at this point. They
-fly 354 steps a second, and 14 minutes are left. The last 100 training flights earned a reward of
+fly 233 steps a second, and 21 minutes are left. The last 100 training flights earned a reward of
 -20.7 each on average. Then came the test: the network flew through 48 forests without random
 actions. It earned 19.9 per flight, stayed in the air 353 % longer than the random pilot, crossed
 the forest in 17 % of the flights, and crashed in 6 %.
 
-A seed is a forest. Training plants forests from [0, 10^9). Test points choose the weights to keep,
-and fly forests from [10^9, 2 * 10^9). `eval` starts at 2 * 10^9, so its forests neither shaped the
-weights nor chose them. A run's folder holds config.json, log.csv, best.pt and checkpoint.pt.
+A seed is a forest. Training plants forests from [0, 10^9). Test points fly forests from [10^9,
+2 * 10^9), and may choose the weights to keep. `eval` starts at 2 * 10^9, so its forests neither
+shaped the weights nor chose them. A run's folder holds config.json, log.csv, best.pt and
+checkpoint.pt.
 
 Legend
     L  drones that fly side by side
@@ -88,8 +89,8 @@ SETTINGS = (*fields(DQNConfig), *fields(RunConfig))
 # flying ahead is not the aim: a pilot that is paid for it passes the goal.
 BEACON = {"forward_reward": 0.0, "far_value": 50.0}
 # [Mnih15, Extended Data Table 1], as the paper says [DF §II-B]. 1.4 M steps are the paper's own.
-# Eight drones still fly side by side. The table counts the target network's 10,000 in updates, but
-# its authors' code counts steps. We follow the code: 10,000 steps are 2,500 updates.
+# Eight drones still fly side by side. Mnih's table counts the target network's 10,000 in updates.
+# Mnih's code counts steps. We follow the code: 10,000 steps are 2,500 updates.
 MNIH = dict(
     steps=1_400_000, replay_size=1_000_000, learning_starts=50_000, target_every=2_500,
     epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, double=False, n_steps=1, mirror=False,
@@ -112,8 +113,8 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
         + gamma * goal_value       0.99 * 125 = 123.75, once          on arrival at the goal
         + gamma * far_value        0.99 * 200 = 198, once             on leaving by the far edge
 
-    Why forward_reward: r depends on where the drone is. A drone that circles earns as much as one
-    that flies on.
+    Why forward_reward: r depends on where the drone is, and not on where it goes. A drone that
+    circles in one place earns there as much as one that flies through it.
     Why goal_value: arrival ends the flight, and with it all rewards. A drone that circled at the
     goal for ever would earn 1.25 + 0.99 * 1.25 + 0.99^2 * 1.25 + ... = 1.25 / (1 - 0.99) = 125.
     If arrival paid less, circling would be better. So the last reward gets gamma * 125 more, as if
@@ -179,7 +180,7 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
         delta = c.huber if step > c.huber_after else 1.0
 
         fleet.reset(fleet.landed, rng.integers(TRAIN_END, size=len(fleet.landed)))  # 4, 5
-        s = fleet.observations  # (L, 4, 84, 84) 6: all L drones are in the air
+        s = fleet.observations  # 6 (L, 4, 84, 84), because all L drones are in the air
         explore = rng.random(c.num_envs) < epsilon  # (L,) 7
         anything = rng.integers(world.actions, size=c.num_envs)  # (L,)
         a = np.where(explore, anything, greedy(agent.q, s))  # (L,) 8
@@ -187,8 +188,8 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
         r = learner_reward(r, infos, rc, c.gamma)  # (L,) [+forward_reward] and the two values
         end = np.where(terminated, dqn.TERMINAL, np.where(truncated, dqn.TRUNCATED, dqn.LIVE))
         replay.add(s, a, r, s2, end)  # 11
-
-        for _ in range(run.due(c.update_every) if step >= c.learning_starts else 0):
+        updates = run.due(c.update_every) if step >= c.learning_starts else 0
+        for _ in range(updates):
             batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
             batch = mirror(batch, world.actions, rng) if c.mirror else batch  # [+mirror]
             b = dqn.Batch(*map(torch.from_numpy, batch))
@@ -421,7 +422,7 @@ class Run:
         q = copy.deepcopy(q).half().float()  # what best.pt keeps is in half precision: fly that
         row = {"step": book["step"], "episodes": book["episodes"], "updates": self.agent.updates}
         row["epsilon"] = epsilon
-        recent = book["recent"] or [env.flight() for env in self.fleet.envs]  # if none has landed
+        recent = book["recent"] or [drone.flight() for drone in self.fleet.envs]  # none has landed
         flown = {"train": recent, "test": fly(dqn_pilot(q), TESTS, self.fleet.world)}
         for who, flights in flown.items():
             row |= {f"{who}_{key}": x.mean().item() for key, x in measure(flights).items()}

@@ -105,7 +105,7 @@ import fcntl
 import hashlib
 import io
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -151,7 +151,7 @@ class DQNConfig:
     double: bool = setting(True, "[+] Double DQN [van Hasselt 2016]; --no-double: off", 0, 1)
     n_steps: int = setting(5, "[+] true rewards in a label; 1: off", 1, 100)
     mirror: bool = setting(True, "[+] reflect half of every batch; --no-mirror: off", 0, 1)
-    huber: float = setting(100.0, "[+] errors above it pull no harder; 1: Mnih's", 1e-3, 1e6)
+    huber: float = setting(100.0, "[+] delta: larger errors pull no harder; 1: Mnih's", 1e-3, 1e6)
     huber_after: int = setting(100_000, "[+] control steps with Mnih's 1, then huber", 0)
     lr_decay: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
     max_grad_norm: float = setting(10.0, "[+] longer gradients are cut to this; 0: off", 0, 1e6)
@@ -159,7 +159,7 @@ class DQNConfig:
     bfloat16: bool = setting(True, "[+] quick convolutions if the CPU has it; --no-bfloat16", 0, 1)
 
 
-# -------------------------------------------------- plain DQN
+# -------------------------------------------------- DQN
 
 
 class QNetwork(nn.Module):
@@ -243,7 +243,8 @@ class Replay:
 
     Each picture is kept once, 7,056 bytes, and a state is put together from four of them when it is
     drawn. To keep s and s2 whole would cost eight times as much. Row t, lane l holds the newest
-    picture of s_t of drone l, the action taken there, its reward and how it ended.
+    picture of s_t of drone l, the action taken there, its reward and how it ended. The rows are a
+    ring: when the last one is written, the first is written again.
 
         lane 0   x x x|x x x x x x x x     |: a flight's end, which no stack and no n-step
         lane 1   x x x x x|x x x x x x        window crosses
@@ -297,11 +298,11 @@ class Replay:
     def window(self, row: ndarray, lane: ndarray, n: int, gamma: float) -> Batch:
         """The transitions that start at row (B,), lane (B,), each over n steps.
 
-        [+n_steps] With n = 2 the label of Q(s_0, a_0) is r_0 + gamma * r_1 + gamma^2 * max Q^(s_2,
-        .): two true rewards, then the estimate. So the truth moves n states backwards with each
-        update, and not one. The price: r_1 followed from the action that was taken in s_1. If that
-        was not the best one, the label is too low. We accept that, because it learns sooner. A
-        window stops at the end of a flight.
+        [+n_steps] With n = 2 the label of Q(s_0, a_0) is r_0 + gamma * r_1 + gamma * gamma * (the
+        greatest Q^ in s_2): two true rewards, then the estimate. So the truth moves n states
+        backwards with each update, and not one. The price: r_1 followed from the action that was
+        taken in s_1. If that was not the best one, the label is too low. We accept that, because it
+        learns sooner. A window stops at the end of a flight.
         """
         # last: the row of the newest reward in r. power: gamma^k for the reward k steps on. In the
         # example, row 1, n = 3: pass 1 gives last 2, power 0.99, r = 1 - 9.9; pass 2 adds nothing.
@@ -342,13 +343,6 @@ class Agent(nn.Module):
         self.q_target.load_state_dict(self.q.state_dict())  # line 3
         self.mean = AveragedModel(self.q)  # [+average]
         self.optimizer = make_optimizer(self.q.parameters(), c)
-        # An update by a gradient of 0 moves no weight, and makes the optimizer's running means. So
-        # every checkpoint holds the same tensors. Adam's count of updates goes back to 0.
-        for w in self.q.parameters():
-            w.grad = torch.zeros_like(w)
-        self.optimizer.step()
-        for means in self.optimizer.state.values():
-            means.get("step", torch.zeros(())).zero_()
 
     def get_extra_state(self) -> dict[str, Any]:
         """What a checkpoint needs besides weights; PyTorch's state_dict calls this."""
@@ -362,13 +356,29 @@ class Agent(nn.Module):
         self.updates = state["updates"]
 
 
+# -------------------------------------------------- mirror images, optimizers
+
+
+def mirror(batch: Batch, actions: int, rng: Generator) -> Batch:
+    """[+mirror] Reflect half of the transitions: pictures left to right, a -> A - 1 - a.
+
+    Flight, reward and camera are symmetric, so the reflection is one more true transition, for
+    free. Only the forest's grid is not quite symmetric: it stands 0.5 m off centre.
+    """
+    flip = rng.random(len(batch.a)) < 0.5  # (B,)
+    for frames in (batch.s, batch.s2):
+        frames[flip] = frames[flip, ..., ::-1]
+    batch.a[flip] = actions - 1 - batch.a[flip]
+    return batch
+
+
 class RMSprop(torch.optim.Optimizer):
     """[Mnih15]'s optimizer. A weight's gradient g moves it by -lr * g / sqrt(variance + epsilon).
 
-    The variance is the running mean of g^2, less the square of the running mean of g. Both of the
-    paper's 0.95 are decay factors of these means, so nothing here is a velocity, and PyTorch's own
-    RMSprop with momentum is another algorithm. The paper's epsilon is 0.01 for a gradient that is
-    the sum over a batch of 32. Ours is the mean, so the epsilon is 0.01 / 32^2.
+    The variance is the running mean of g^2, less the square of the running mean of g. Both of
+    Mnih's 0.95 are decay factors of these means. PyTorch's own RMSprop with momentum 0.95 is
+    another algorithm: it has a velocity. Mnih's epsilon is 0.01 for a gradient that is the sum over
+    a batch of 32. Ours is the mean, so our epsilon is 0.01 / 32^2.
     """
 
     def __init__(self, theta: Any, lr: float) -> None:
@@ -387,26 +397,22 @@ class RMSprop(torch.optim.Optimizer):
             w.addcdiv_(w.grad, deviation, value=-self.param_groups[0]["lr"])
 
 
-def make_optimizer(theta: Any, c: DQNConfig) -> torch.optim.Optimizer:
-    """[+adam] Adam gives each weight a stride of its own and needs little tuning. Without it: the
-    RMSprop of [Mnih15]. theta: the weights."""
-    return torch.optim.Adam(theta, c.lr, eps=1.5e-4, fused=True) if c.adam else RMSprop(theta, c.lr)
-
-
-# -------------------------------------------------- what is not in the textbook
-
-
-def mirror(batch: Batch, actions: int, rng: Generator) -> Batch:
-    """[+mirror] Reflect half of the transitions: pictures left to right, a -> A - 1 - a.
-
-    Flight, reward and camera are symmetric, so the reflection is one more true transition, for
-    free. Only the forest's grid is not quite symmetric: it stands 0.5 m off centre.
-    """
-    flip = rng.random(len(batch.a)) < 0.5  # (B,)
-    for frames in (batch.s, batch.s2):
-        frames[flip] = frames[flip, ..., ::-1]
-    batch.a[flip] = actions - 1 - batch.a[flip]
-    return batch
+def make_optimizer(theta: Iterable[Tensor], c: DQNConfig) -> torch.optim.Optimizer:
+    """[+adam] Adam divides by the root of the mean square of g, not of its variance, and follows a
+    running mean of g. It needs little tuning. Without it: the RMSprop of [Mnih15]. theta: the
+    weights."""
+    theta = list(theta)
+    if not c.adam:
+        return RMSprop(theta, c.lr)
+    adam = torch.optim.Adam(theta, c.lr, eps=1.5e-4, fused=True)
+    # An update by a gradient of 0 moves no weight, and makes Adam's running means. So every
+    # checkpoint holds the same tensors. Its count of updates goes back to 0.
+    for w in theta:
+        w.grad = torch.zeros_like(w)
+    adam.step()
+    for means in adam.state.values():
+        means["step"].zero_()
+    return adam
 
 
 # Where the processor has no bfloat16 of its own, float32 is quicker.

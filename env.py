@@ -20,7 +20,7 @@ the drone what to do. To fly well is to collect much reward over a whole flight.
     | in the air, d_obs > 2.0 m            | r_safe + r_goal                                     |
     | in the air, d_obs from 2.0 to 0.75 m | r_near + r_goal                                     |
     | in a crash, d_obs < 0.75 m           | r_crash                                             |
-    | outside, beyond any edge (x < -2 too)| r_crash                                             |
+    | outside: x < -2, x > 90, abs(y) > 25 | r_crash                                             |
     | at the goal, or out of time          | as in the air                                       |
 
     r_safe = 0.25    r_crash = -10    r_goal = 1 - d_goal / d_max, 0 at the start and 1 at the goal
@@ -30,7 +30,7 @@ One step in numbers: the drone is at x = 30 on the middle line, so d_goal = 60, 
 is 1.5 m away. That is too close: -5 * (2.0 - 1.5) / (2.0 - 0.75) = -2. A third of the way is made:
 1 - 60 / 90 = 0.33. The reward of the step is -1.67.
 
-This is the paper's reward. To leave by the far edge costs -10 too, although it is what a pilot that
+This is the paper's reward. To leave by the far edge costs 10 too, although it is what a pilot that
 cannot see the goal should do. So the network is paid more than this: see `learner_reward` in
 deepflight.py.
 
@@ -51,7 +51,7 @@ Legend
     psi       rad, the heading
     N         trunks
     L         drones that fly side by side, one in each lane
-    F         those of them that are in the air
+    F         those of them that are in the air; in `measure`, flights
     A         actions
     [DF]      the Deep Flight paper; "authors' simulator" is the code released with it
     ours      a number that neither gives, chosen by us
@@ -154,8 +154,8 @@ def grid(world: World) -> ndarray:
 class ForestEnv:
     """One drone, one forest, a new one every flight; Gymnasium 1.x signatures.
 
-    Observation: (4, 84, 84) uint8, oldest picture first, the first one repeated at reset. It is the
-    caller's own: to write into it changes no other.
+    Observation: (4, 84, 84) uint8, oldest picture first, the first one repeated at reset. Who
+    writes into it changes no later observation.
     Action: an int, 0 turns right at 0.7 rad/s, 4 flies straight, 8 turns left.
     `camera=False` leaves the pictures black, for pilots that look at nothing or at the laser.
     """
@@ -357,7 +357,7 @@ class Fleet:
         return [[(seed, "".join(map(str, a))) for seed, a in lane] for lane in self.records]
 
 
-# -------------------------------------------------- pilots that need no network: skim these
+# -------------------------------------------------- pilots without a network, many flights: skim
 
 Pilot = Callable[[Fleet], Sequence[int]]  # an action for each drone in the air
 Flights = list[dict[str, Any]]  # of ForestEnv.flight
