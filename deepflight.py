@@ -37,6 +37,11 @@ Not in this file: how pictures are drawn (render.py), drones fly (env.py) or net
 has the parts, and `train` puts them together).
 """
 
+import signal
+
+if __name__ == "__main__" and signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback while torch loads, for seconds
+
 import argparse
 import copy
 import json
@@ -45,17 +50,14 @@ import os
 import re
 import shlex
 import shutil
-import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import Field, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, NoReturn
-
-if __name__ == "__main__":  # Ctrl-C while torch is loaded, which takes seconds: no traceback
-    CTRL_C = signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import numpy as np
 import torch
@@ -71,13 +73,16 @@ TRAIN_END, TEST_FIRST, EVAL_FIRST = 10**9, 10**9, 2 * 10**9  # forest seeds
 TESTS = range(TEST_FIRST, TEST_FIRST + 48)  # the forests of a test point
 
 
+CORES = max(os.cpu_count() or 1, 8)  # more threads than these would stand in each other's way
+
+
 @dataclass(frozen=True)
 class RunConfig:
     """The experiment's settings; dqn.py has those of the algorithm. Each is a flag of `train`."""
 
     seed: int = dqn.setting(0, "of everything random", 0, 1e18)
     beacon: bool = dqn.setting(False, "put a visible pole at the goal", 0, 1)
-    threads: int = dqn.setting(2, "of the CPU; other numbers give other last digits", 1, 256)
+    threads: int = dqn.setting(2, "of the CPU; other numbers give other last digits", 1, CORES)
     test_every: int = dqn.setting(5_000, "control steps between test points, which also save", 1)
     forward_reward: float = dqn.setting(6.0, "[+] paid per metre flown forward; 0: off", 0, 1e3)
     goal_value: float = dqn.setting(125.0, "[+] worth of arrival at the goal; 0: off", -1e6, 1e6)
@@ -236,21 +241,21 @@ def evaluate(args: argparse.Namespace) -> int:
     flights = {p: bar if p == "random" else fly(pilots[p], seeds, world) for p in args.pilots}
     draws = rng.integers(len(seeds), size=(2000, len(seeds)))  # (2000, forests) resampled
     figures = {p: summarize(flights[p], bar, draws) for p in flights}
+    many = f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n"
+    say(many if len(seeds) > 1 else f"1 forest, of seed {seeds[0]}\n")
+    print_table(figures)
     if args.json:
         report = {"program": "Deep Flight", "weights": str(args.weights), "beacon": args.beacon}
         report |= {"first_seed": seeds[0], "forests": len(seeds)}
         report["pilots"] = {p: figures[p] | {"flights": flights[p]} for p in flights}
         with dqn.whole_file(args.json) as file:
             file.write(json.dumps(report).encode())
-    many = f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in brackets\n"
-    say(many if len(seeds) > 1 else f"1 forest, of seed {seeds[0]}\n")
-    print_table(figures)
     say(f"\nwrote {args.json}" if args.json else "")
     best = int(measure(flights[args.pilots[-1]])["crossed"].argmax())  # the first to cross, or 0
     with dqn.whole_file(gif) as file:
         pictures = film({p: flights[p][best] for p in flights}, world, q)
         render.save_film(file, pictures, round(1000 * world.dt))
-    say(f"wrote {gif}: forest {seeds[best]}, pilot {args.pilots[-1]}")
+    say(f"wrote {gif}: forest {seeds[best]}, {args.pilots[-1]}")
     return 0
 
 
@@ -343,6 +348,7 @@ def track(flight: dict[str, Any], world: World) -> tuple[ndarray, str]:
 HEAD = "     step  eps    /s left reward |  test longer cross crash"
 ROW = "{step:9,}{epsilon:5.2f}{speed:6.0f}{eta:5.0f}{train_return:7.1f} |{test_return:6.1f}"
 ROW += "{test_over_random:z7.0%}{test_crossed:6.0%}{test_crash:6.0%}"
+WEIGHTS = b"PK.*weights"  # how a file of dqn.save_weights begins
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, kill, a closed terminal
 
 
@@ -356,12 +362,10 @@ class Run:
         self.folder, self.c, self.rc, self.stopped = folder, c, rc, 0
         self.agent, self.replay, self.fleet, self.rng = parts
         self.book = {"step": 0, "episodes": 0, "seconds": 0.0, "recent": [], "log": [], "best": []}
-        self.book["bar"] = 0.0  # steps that random flies through the test forests
         if saved:
             self.restore(saved)
-        else:
-            bar = fly_random(TESTS, self.fleet.world, np.random.default_rng(0))
-            self.book["bar"] = measure(bar)["steps"].mean().item()
+        bar = fly_random(TESTS, self.fleet.world, np.random.default_rng(0))
+        self.bar = measure(bar)["steps"].mean()  # steps that random flies through the test forests
         folder.mkdir(parents=True, exist_ok=True)
         self.save()
         with dqn.whole_file(folder / "config.json") as file:
@@ -373,6 +377,7 @@ class Run:
         taken = STOPS if threading.current_thread() is threading.main_thread() else ()
         taken = [n for n in taken if signal.getsignal(n) != signal.SIG_IGN]
         handlers = {n: signal.signal(n, self.stop) for n in taken}
+        ENDING.clear()
         self.started = time.perf_counter() - self.book["seconds"]
         steps = math.ceil(self.c.steps / self.c.num_envs) * self.c.num_envs
         try:
@@ -387,9 +392,9 @@ class Run:
     def stop(self, number: int, _frame: object) -> None:
         """A first signal lets the step end and saves; a second stops at once."""
         if self.stopped:
-            raise KeyboardInterrupt
+            stop_at_once(number, None)
         self.stopped = number
-        say("\nstopping: this step ends and is saved; once more stops at once", file=sys.stderr)
+        say("\nstopping: this step ends and is saved; again: at once", file=sys.stderr)
 
     @property
     def last_share(self) -> bool:
@@ -426,7 +431,7 @@ class Run:
         flown = {"train": recent, "test": fly(dqn_pilot(q), TESTS, self.fleet.world)}
         for who, flights in flown.items():
             row |= {f"{who}_{key}": x.mean().item() for key, x in measure(flights).items()}
-        row["test_over_random"] = row["test_steps"] / book["bar"] - 1
+        row["test_over_random"] = row["test_steps"] / self.bar - 1
         book["log"] = [*(book["log"] or [",".join(row)]), ",".join(map(str, row.values()))]
         with dqn.whole_file(self.folder / "log.csv") as file:
             file.write("\n".join([*book["log"], ""]).encode())
@@ -489,7 +494,7 @@ class Run:
 
     def finish(self) -> int:
         """The exit code: 0; or, saved and with the command that goes on, 128 and the signal."""
-        if not self.stopped:
+        if not self.stopped or self.book["step"] >= self.c.steps:
             return 0
         self.save()
         say(f"saved at step {self.book['step']:,}; {resume_line(self.folder)}", file=sys.stderr)
@@ -502,6 +507,16 @@ def resume_line(folder: Path) -> str:
     return (
         f"to go on:\n{shlex.join([sys.executable, str(script), 'train', '--resume', str(folder)])}"
     )
+
+
+ENDING: list[int] = []  # the signal that ends the program
+
+
+def stop_at_once(number: int, _frame: object) -> None:
+    """End by a KeyboardInterrupt. Whoever keeps pressing Ctrl-C finds the program ending."""
+    if not ENDING:
+        ENDING.append(number)
+        raise KeyboardInterrupt
 
 
 class Parser(argparse.ArgumentParser):
@@ -529,8 +544,8 @@ def describe(f: Field) -> str:
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; every setting is a flag of `train`. Raises ValueError."""
-    parser = Parser(prog="deepflight.py", description=__doc__.splitlines()[0])
-    commands = parser.add_subparsers(dest="command", required=True)
+    parser = Parser(prog="deepflight.py", description="Train a pilot, fly it against others.")
+    commands = parser.add_subparsers(metavar="train or eval", required=True)
     sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
     sub.set_defaults(run=start_training, preset="default", name=None, resume=None)
     sub.add_argument("--preset", choices=("default", "mnih"), help="mnih: [Mnih15]'s parameters")
@@ -538,6 +553,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     sub.add_argument("--resume", type=place, help="folder of a training to go on with")
     for f in SETTINGS:
         kind = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type}
+        kind |= {} if f.type is bool else {"metavar": "N" if f.type is int else "X"}
         sub.add_argument("--" + f.name.replace("_", "-"), help=describe(f), **kind)
     sub = commands.add_parser("eval", help="fly trained weights against three other pilots")
     sub.set_defaults(run=evaluate)
@@ -566,24 +582,26 @@ def start_training(args: argparse.Namespace) -> int:
             raise ValueError(f"{args.resume} keeps its own settings: give none but --steps")
         return resume_training(args.resume, given)
     if args.name is not None and not re.fullmatch(r"\w[\w.-]{0,99}", args.name, re.ASCII):
-        legal = "up to 100 letters, digits, dots, dashes and underscores"
+        legal = "100 of a-z, A-Z, 0-9, dot, dash, underscore; the first no dot or dash"
         raise ValueError(f"name is {args.name!r}, allowed are {legal}")
     preset = (BEACON if given.get("beacon") else {}) | (MNIH if args.preset == "mnih" else {})
     c, rc = configure(preset | given)
     numbers = (Path(f"runs/{i:03d}") for i in range(1, 10**6))
     folder = Path("runs") / args.name if args.name else next(p for p in numbers if not p.exists())
+    made = [path for path in (folder, folder.parent) if not path.exists()]
     try:
         folder.mkdir(parents=True)
     except OSError as error:
-        text = f"{folder} cannot be made: {error.strerror} (to go on with a training: --resume)"
-        raise ValueError(text) from None
+        hint = f"; to go on with it: --resume {folder}" if folder.exists() else ""
+        raise ValueError(f"{folder} cannot be made: {error.strerror}{hint}") from None
     args.resume = folder  # should it be interrupted
     try:
         with dqn.lock_folder(folder):
             return train(c, rc, folder)
     finally:
-        if not (folder / "checkpoint.pt").exists():
-            shutil.rmtree(folder)
+        for path in made:
+            with suppress(OSError):  # something has been saved there
+                path.rmdir()
 
 
 def resume_training(folder: Path, given: dict[str, Any]) -> int:
@@ -593,8 +611,14 @@ def resume_training(folder: Path, given: dict[str, Any]) -> int:
     with dqn.lock_folder(folder):
         for part in folder.glob(".*.part"):  # of a save that was killed
             part.unlink()
-        for name in ("best.pt", "config.json", "log.csv"):
-            dqn.check_output(folder / name, b"")
+        for name, mark in (
+            ("best.pt", WEIGHTS),
+            ("config.json", b'{.*"steps"'),
+            ("log.csv", b"step,"),
+        ):
+            if (folder / name).is_symlink():
+                raise ValueError(f"{folder / name} is a link: take it away")
+            dqn.check_output(folder / name, mark)
         saved = dqn.load(folder / "checkpoint.pt", "checkpoint")
         like = {"settings": asdict(DQNConfig()) | asdict(RunConfig()), "machine": dqn.MACHINE}
         dqn.check_like({key: saved.get(key) for key in like}, like, folder / "checkpoint.pt")
@@ -624,45 +648,52 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
 def load_pilot(args: argparse.Namespace) -> QNetwork:
     """Check all that is given before anything flies, and read the weights. Raises ValueError."""
     for name, low, high in (
-        ("episodes", 1, 10**6), ("first_seed", 0, 10**18), ("threads", 1, 256)
+        ("episodes", 1, 10**6), ("first_seed", 0, 10**18), ("threads", 1, CORES)
     ):  # fmt: skip
         if not low <= (value := vars(args)[name]) <= high:
             raise ValueError(f"{name} is {value}, allowed are whole numbers from {low} to {high:,}")
     torch.set_num_threads(args.threads)
-    shipped = Path(__file__).parent / "weights" / ("beacon.pt" if args.beacon else "paper.pt")
+    shipped = (
+        Path(__file__).resolve().parent / "weights" / ("beacon.pt" if args.beacon else "paper.pt")
+    )
     args.weights = args.weights or shipped
     q = dqn.load_weights(args.weights, World.actions, beacon=args.beacon)
-    outputs = [args.out / "flight.gif", *([args.json] if args.json else [])]
-    for path in outputs:
-        dqn.check_output(path, b"Deep Flight")
-    if len({os.path.realpath(path) for path in outputs}) < len(outputs):
-        raise ValueError(f"json is {args.json}, which is the film's file: name another")
-    for path in outputs:
-        Path(os.path.realpath(path)).parent.mkdir(parents=True, exist_ok=True)
+    dqn.check_output(args.out / "flight.gif", b"GIF8.*Deep Flight")
+    if args.json:
+        dqn.check_output(args.json, b'{"program": "Deep Flight"')
+        gif, report = (os.path.realpath(x) for x in (args.out / "flight.gif", args.json))
+        if f"{gif}/".startswith(f"{report}/") or f"{report}/".startswith(f"{gif}/"):
+            raise ValueError(f"json is {args.json}, where the film goes: name another file")
     return q
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; what goes wrong is one line: bad input exit code 2, trouble on the way 1."""
-    args = argparse.Namespace()
-    for stream in filter(None, (sys.stdout, sys.stderr)):
-        stream.reconfigure(errors="backslashreplace")  # a name that cannot be printed is no trouble
+    """Run one command. What goes wrong is one line: bad input exit code 2, trouble on the way 1."""
+    args, text, code = argparse.Namespace(), "", 0
+    ENDING.clear()
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a name that cannot be printed is no trouble
+            stream.reconfigure(errors="backslashreplace")
     try:
         args = parse(argv)
         return args.run(args)
-    except (ValueError, MemoryError, FloatingPointError, OSError) as error:
-        text = "".join(x if x.isprintable() else "?" for x in str(error))
-        say(f"deepflight.py: error: {text}", file=sys.stderr)
-        return 1 if isinstance(error, FloatingPointError | OSError) else 2
     except KeyboardInterrupt:
-        folder = vars(args).get("resume")
-        saved = folder and (folder / "checkpoint.pt").exists()
-        say("\ninterrupted" + (f"; {resume_line(folder)}" if saved else ""), file=sys.stderr)
-        return 130
+        text, code = "\ninterrupted", 128 + (ENDING or [signal.SIGINT])[0]
+    except (ValueError, MemoryError, RuntimeError, FloatingPointError, OSError) as error:
+        text = "".join(x if x.isprintable() else "?" for x in str(error) or "out of memory")
+        text, code = f"deepflight.py: error: {text}", 2 if isinstance(error, ValueError) else 1
     finally:
-        say("", end="")  # what was printed last
+        with suppress(OSError):
+            say("", end="")  # what was printed last
+    say(text, file=sys.stderr)
+    folder = vars(args).get("resume")
+    if code != 2 and folder and (folder / "checkpoint.pt").exists():
+        say(resume_line(folder), file=sys.stderr)
+    return code
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, CTRL_C)
+    for number in STOPS:
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, stop_at_once)
     sys.exit(main())

@@ -105,6 +105,7 @@ import fcntl
 import hashlib
 import io
 import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -265,7 +266,10 @@ class Replay:
 
     def __init__(self, capacity: int, lanes: int) -> None:
         shape = (capacity // lanes, lanes)
-        self.frames = np.empty((*shape, 84, 84), np.uint8)  # (T, L, 84, 84)
+        try:
+            self.frames = np.empty((*shape, 84, 84), np.uint8)  # (T, L, 84, 84)
+        except MemoryError:
+            raise ValueError(f"replay_size is {capacity:,}: too many for this memory") from None
         self.actions = np.zeros(shape, np.uint8)  # (T, L)
         self.rewards = np.zeros(shape, np.float32)  # (T, L)
         self.ends = np.zeros(shape, np.uint8)  # (T, L)
@@ -429,34 +433,50 @@ LARGEST = 2**30  # bytes of a file that is read; a checkpoint has 34 MB
 def whole_file(path: Path) -> Iterator[BinaryIO]:
     """A file to write. It stands under its name when it is whole, and till then the old one does.
 
-    Links are followed to their target. Raises OSError where nothing can be written.
+    Links are followed to their target, folders made. Raises OSError where that is impossible.
     """
     target = Path(os.path.realpath(path))
-    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = part_file(target, delete=False)
     try:
-        with part.open("xb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
+        with part:
+            yield part
+            part.flush()
+            os.fsync(part.fileno())
+        os.umask(umask := os.umask(0))
+        os.chmod(part.name, 0o666 & ~umask)
+        os.replace(part.name, target)
+    except BaseException:
+        os.unlink(part.name)
+        raise
+
+
+def part_file(target: Path, delete: bool) -> Any:
+    """A new file beside a file that is to be written."""
+    folder = next(parent for parent in target.parents if parent.exists())
+    name = {"prefix": f".{target.name}.", "suffix": ".part"}
+    return NamedTemporaryFile(dir=folder, delete=delete, **name)
 
 
 def check_output(path: Path, mark: bytes) -> None:
     """Raise ValueError unless a file can be written there, and the name is free or that of a file
-    which has this mark in its first 1,000 bytes: then we wrote it, and may replace it."""
+    whose first 1,000 bytes match this pattern: then we wrote it, and may replace it."""
     try:
         target = Path(os.path.realpath(path))
-        if os.path.lexists(target) and not (
-            target.is_file() and mark in target.open("rb").read(1000)
-        ):
+        if os.path.lexists(target) and not re.match(mark, head(target), re.DOTALL):
             raise ValueError(f"{path} exists, and this program did not write it: name another file")
-        folder = next(parent for parent in target.parents if parent.exists())
-        with NamedTemporaryFile(dir=folder, prefix=f".{target.name}.{os.getpid()}.part"):
+        with part_file(target, delete=True):
             pass  # so a file can be made there
     except OSError as error:
         raise ValueError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def head(path: Path) -> bytes:
+    """The first 1,000 bytes of a regular file; none of anything else."""
+    if not path.is_file() or not path.stat().st_size:  # /proc has files of size 0 that block
+        return b""
+    with path.open("rb") as file:
+        return file.read(1000)
 
 
 def save(path: Path, kind: str, content: dict) -> None:
@@ -474,7 +494,7 @@ def load(path: Path, kind: str) -> dict:
     on purpose can have the right one. So `check_like` has to look at what this returns.
     """
     try:
-        if not path.is_file() or path.stat().st_size > LARGEST:
+        if not path.is_file() or not 0 < path.stat().st_size <= LARGEST:
             raise ValueError(f"{path} is no file of {kind}, such as train writes to runs/001")
         archive, digest = (data := path.read_bytes())[:-32], data[-32:]
         if hashlib.sha256(archive).digest() != digest:
@@ -482,10 +502,11 @@ def load(path: Path, kind: str) -> dict:
         if sum(x.file_size for x in ZipFile(io.BytesIO(archive)).infolist()) > LARGEST:
             raise ValueError(f"{path} is larger inside than {LARGEST:,} bytes")
         content = torch.load(io.BytesIO(archive), weights_only=True)
-    except (ValueError, OSError):
+    except ValueError:
         raise
     except Exception as error:  # such an archive can fail in torch.load in any way
-        raise ValueError(f"{path} cannot be read: {type(error).__name__}") from None
+        why = getattr(error, "strerror", None) or type(error).__name__
+        raise ValueError(f"{path} cannot be read: {why}") from None
     if not isinstance(content, dict) or content.pop("kind", None) != kind:
         raise ValueError(f"{path} holds something else than {kind}")
     return content
@@ -513,6 +534,8 @@ def check_like(found: Any, like: Any, where: object) -> None:
     numbers = isinstance(like, Tensor | float) and not torch.as_tensor(found).isfinite().all()
     if numbers or (isinstance(like, int) and not 0 <= found < 2**128):
         raise ValueError(f"{where} is no number that can be: not finite, negative or too large")
+    if isinstance(like, str) and not found.isascii():
+        raise ValueError(f"{where} is no text of ours")
 
 
 def pack(q: QNetwork, world: dict[str, Any]) -> dict[str, Any]:

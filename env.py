@@ -60,6 +60,7 @@ Not in this file: rotors, wind, inertia, altitude. `ForestEnv` has the methods o
 environment (the usual interface in this field) and does not need gymnasium.
 """
 
+import errno
 import math
 import operator
 import os
@@ -432,8 +433,10 @@ def say(text: str, end: str = "\n", file: TextIO | None = None) -> None:
     file = file or sys.stdout
     try:
         print(text, end=end, file=file, flush=True)
-    except OSError:
+    except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
+        if error.errno not in (errno.EPIPE, errno.EIO):
+            raise
 
 
 def show(text: str) -> None:

@@ -268,6 +268,10 @@ eval --json link
 eval --json runs/eval/flight.gif
 eval --json text.pt/x.json
 eval --json LONG
+eval --json diary
+eval --json o --out o
+eval --json o/flight.gif/r.json --out o
+eval --weights LONG
 eval --out taken
 eval --out EMPTY
 eval --out text.pt
@@ -291,6 +295,7 @@ def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
     (tmp_path / "runs/taken/log.csv").write_text("step")
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken/flight.gif").write_bytes(b"GIF89a, and not ours")
+    (tmp_path / "diary").write_text("my diary on Deep Flight")
     (tmp_path / "link").symlink_to(tmp_path / "text.pt")
     os.mkfifo(tmp_path / "pipe")
     network = {name: x.half() for name, x in QNetwork(9).state_dict().items()}

@@ -615,19 +615,19 @@ def test_a_file_is_written_where_the_name_is_free_or_our_own_and_nowhere_else(
 ) -> None:
     ours, theirs, link, loop = (tmp_path / name for name in ("ours", "theirs", "link", "loop"))
     ours.write_text('{"program": "Deep Flight"}')
-    theirs.write_text("my diary")
+    theirs.write_text("my diary on Deep Flight")
     link.symlink_to(theirs)
     loop.symlink_to(loop)
     os.mkfifo(tmp_path / "pipe")
     before = sorted(tmp_path.rglob("*"))
     for path in (ours, tmp_path / "new", tmp_path / "a/b/new"):
-        check_output(path, b"Deep Flight")
+        check_output(path, b'{"program": "Deep Flight"')
     for path in (theirs, link, loop, tmp_path / "pipe", tmp_path, Path("/dev/null")):
         with pytest.raises(ValueError, match="this program did not write it"):
-            check_output(path, b"Deep Flight")
+            check_output(path, b'{"program": "Deep Flight"')
     for path in (theirs / "new", tmp_path / ("x" * 250), Path("/proc/new")):
         with pytest.raises(ValueError, match="cannot be written"):
-            check_output(path, b"Deep Flight")
+            check_output(path, b'{"program": "Deep Flight"')
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -654,13 +654,16 @@ def test_a_file_with_any_byte_changed_is_refused(tmp_path: Path) -> None:
 def test_a_file_cut_short_or_of_another_kind_is_refused(tmp_path: Path) -> None:
     path = weights_file(tmp_path)
     whole = path.read_bytes()
-    for length in (0, 1, 31, 32, 33, len(whole) // 2, len(whole) - 32, len(whole) - 1):
+    for length in (1, 31, 32, 33, len(whole) // 2, len(whole) - 32, len(whole) - 1):
         path.write_bytes(whole[:length])
         with pytest.raises(ValueError, match="digest is wrong"):
             load(path, "weights")
     path.write_bytes(whole)
     with pytest.raises(ValueError, match="holds something else than checkpoint"):
         load(path, "checkpoint")
+    path.write_bytes(b"")
+    with pytest.raises(ValueError, match="is no file of weights"):
+        load(path, "weights")
     for content in (b"", b"text", b"PK\x03\x04 a broken archive"):
         path.write_bytes(digest(content))
         with pytest.raises(ValueError, match=r"cannot be read|digest is wrong"):

@@ -65,7 +65,10 @@ def test_the_first_table_is_what_eval_prints(capsys: pytest.CaptureFixture) -> N
     deepflight.print_table(figures["pilots"])
     table = capsys.readouterr().out
     assert table in README
-    assert f"{figures['forests']} forests from seed {figures['first_seed']}; 95 %" in README
+    assert (
+        f"{figures['forests']} forests from seed {figures['first_seed']}; 95 % intervals in [ ]"
+        in README
+    )
 
 
 def test_the_forest_named_to_film_a_failure_is_one() -> None:

@@ -186,11 +186,42 @@ def test_ctrl_c_saves_and_prints_the_command_that_goes_on(
     step = load(tmp_path / "runs/small" / CHECKPOINT, "checkpoint")["book"]["step"]
     assert step < SMALL["steps"]
     _, stopping, saved, command = error.splitlines()
-    assert stopping == "stopping: this step ends and is saved; once more stops at once"
+    assert stopping == "stopping: this step ends and is saved; again: at once"
     assert saved == f"saved at step {step}; to go on:"
     done = subprocess.run(shlex.split(command), cwd="/", capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert_same_training(uninterrupted, tmp_path / "runs/small")
+
+
+def test_whatever_is_in_a_folder_that_is_not_ours_stays(
+    uninterrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    run, mine = tmp_path / "run", tmp_path / "mine.csv"
+    mine.write_text("the data of years")
+    for name in ("log.csv", "config.json", "best.pt"):
+        shutil.copytree(uninterrupted, run, dirs_exist_ok=True)
+        (run / name).write_text("notes")
+        assert deepflight.main(["train", "--resume", str(run), "--steps", "808"]) == 2
+        assert "did not write it" in capsys.readouterr().err
+        assert (run / name).read_text() == "notes"
+    shutil.copytree(uninterrupted, run, dirs_exist_ok=True)
+    (run / "log.csv").unlink()
+    (run / "log.csv").symlink_to(mine)
+    assert deepflight.main(["train", "--resume", str(run), "--steps", "808"]) == 2
+    assert mine.read_text() == "the data of years"
+
+
+def test_ctrl_c_held_down_is_no_traceback_and_leaves_nothing(tmp_path: Path) -> None:
+    for words in (("train", *FLAGS, "--name", "small"), ("eval", "--episodes", 3)):
+        process = start(*words, folder=tmp_path)
+        while process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(0.02)
+        _, error = process.communicate()
+        assert process.returncode in (130, -signal.SIGINT)
+        assert "Traceback" not in error
+        assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
@@ -338,14 +369,16 @@ def test_a_full_disk_is_one_line_and_the_old_checkpoint_stays(
     words = ("train", *FLAGS, "--name", "small")
     code, _, error = finish(*words, folder=tmp_path, preexec_fn=no_large_files)
     assert code == 1
-    assert error.count("\n") == 1
-    assert "too large" in error
-    folder = tmp_path / "runs/small"
-    assert not list(tmp_path.rglob("*.part"))
+    trouble, *go_on = error.splitlines()
+    assert "too large" in trouble
     if room == -100:
-        assert load(folder / CHECKPOINT, "checkpoint")["book"]["step"] < SMALL["steps"]
+        assert not list(tmp_path.rglob("*.part"))
+        assert go_on[-1].endswith("--resume " + str(tmp_path / "runs/small"))
+        step = load(tmp_path / "runs/small" / CHECKPOINT, "checkpoint")["book"]["step"]
+        assert step < SMALL["steps"]
     else:
-        assert not folder.exists(), "where nothing could be saved, nothing is left"
+        assert not go_on
+        assert not list(tmp_path.iterdir()), "where nothing could be saved, nothing is left"
 
 
 def test_a_loss_that_is_no_number_stops_the_run_and_names_the_cause(

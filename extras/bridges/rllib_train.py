@@ -49,7 +49,7 @@ from ray.rllib.utils.schedules.scheduler import Scheduler
 from ray.tune.registry import register_env
 from torch import Tensor, nn
 
-from deepflight import Parser, RunConfig, place
+from deepflight import WEIGHTS, Parser, RunConfig, place
 from dqn import DQNConfig, QNetwork, check_output, save_weights
 from extras.bridges.gym_env import ID, Forest
 
@@ -208,7 +208,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     for name, value, high in (("steps", args.steps, MOST_STEPS), ("runners", args.runners, most)):
         if not 1 <= value <= high:
             raise ValueError(f"{name} is {value}, allowed here: whole numbers from 1 to {high:,}")
-    check_output(args.out, b"weights")
+    check_output(args.out, WEIGHTS)
     return args
 
 

@@ -25,7 +25,7 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from deepflight import Parser, RunConfig, configure, place
+from deepflight import WEIGHTS, Parser, RunConfig, configure, place
 from dqn import DQNConfig, QNetwork, check_output, linear_schedule, save_weights
 from env import say
 from extras.bridges.gym_env import Forest
@@ -110,7 +110,7 @@ def parse(argv: Sequence[str] | None) -> tuple[DQNConfig, RunConfig, Path]:
     parser.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
     parser.add_argument("--out", type=place, default="runs/sb3.pt", help="the weights' file")
     args = parser.parse_args(argv)
-    check_output(args.out, b"weights")
+    check_output(args.out, WEIGHTS)
     return *configure({"steps": args.steps, "beacon": args.beacon}), args.out
 
 
