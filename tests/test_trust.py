@@ -95,7 +95,9 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Trainings in this process are watched, and test points are two forests."""
     monkeypatch.setattr(deepflight, "Run", Watched)
     monkeypatch.setattr(deepflight, "TESTS", range(10**9, 10**9 + 2))
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # nohup may ignore it
     yield
+    signal.signal(signal.SIGINT, handler)
     Watched.runs.clear()
     Watched.cuts = set()
 
