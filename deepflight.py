@@ -2,7 +2,7 @@
 
     python deepflight.py train                  the default recipe, in the paper's world
     python deepflight.py train --beacon         where a pole makes the goal visible
-    python deepflight.py train --preset mnih    the paper's training parameters [Mnih15]
+    python deepflight.py train --preset mnih    [Mnih15]'s training parameters, eight drones
     python deepflight.py train --resume DIR     go on with an interrupted training
     python deepflight.py eval                   fly weights/paper.pt against three other pilots
     python deepflight.py eval --beacon          fly weights/beacon.pt where the goal is visible
@@ -349,6 +349,10 @@ HEAD = "     step  eps    /s left reward |  test longer cross crash"
 ROW = "{step:9,}{epsilon:5.2f}{speed:6.0f}{eta:5.0f}{train_return:7.1f} |{test_return:6.1f}"
 ROW += "{test_over_random:z7.0%}{test_crossed:6.0%}{test_crash:6.0%}"
 WEIGHTS = b"PK.*weights"  # how a file of dqn.save_weights begins
+RUN_FILES = {  # of a run's folder, and how each begins
+    "best.pt": WEIGHTS, "config.json": rb'\{\s*"steps": \d', "log.csv": b"step,episodes,updates,",
+    "checkpoint.pt": b"PK.*checkpoint",
+}  # fmt: skip
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, kill, a closed terminal
 
 
@@ -367,6 +371,8 @@ class Run:
         bar = fly_random(TESTS, self.fleet.world, np.random.default_rng(0))
         self.bar = measure(bar)["steps"].mean()  # steps that random flies through the test forests
         folder.mkdir(parents=True, exist_ok=True)
+        for part in (part for name in RUN_FILES for part in folder.glob(f".{name}.????????.part")):
+            part.unlink()  # of a save that was killed
         self.save()
         with dqn.whole_file(folder / "config.json") as file:
             file.write(json.dumps(asdict(c) | asdict(rc), indent=2).encode())
@@ -562,7 +568,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     more = {"choices": names, "default": names, "metavar": "PILOT"}
     sub.add_argument("--pilots", nargs="+", **more, help=f"of {', '.join(names)}; default: all")
     more = {"type": int, "metavar": "N"}
-    sub.add_argument("--episodes", **more, default=100, help="forests, up to 1e6; default: 100")
+    sub.add_argument("--episodes", **more, default=100, help="forests, up to 10,000; default: 100")
     first = "forest to begin with, up to 1e18; default: %(default)s"
     sub.add_argument("--first-seed", **more, default=EVAL_FIRST, help=first)
     sub.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
@@ -587,12 +593,18 @@ def start_training(args: argparse.Namespace) -> int:
     preset = (BEACON if given.get("beacon") else {}) | (MNIH if args.preset == "mnih" else {})
     c, rc = configure(preset | given)
     numbers = (Path(f"runs/{i:03d}") for i in range(1, 10**6))
-    folder = Path("runs") / args.name if args.name else next(p for p in numbers if not p.exists())
-    made = [path for path in (folder, folder.parent) if not path.exists()]
+    folder = (
+        Path("runs") / args.name if args.name else next(p for p in numbers if not os.path.exists(p))
+    )
+    made = [path for path in (folder, folder.parent) if not os.path.exists(path)]
     try:
         folder.mkdir(parents=True)
     except OSError as error:
-        hint = f"; to go on with it: --resume {folder}" if folder.exists() else ""
+        hint = (
+            f"; to go on with it: --resume {folder}"
+            if os.path.exists(folder / "checkpoint.pt")
+            else ""
+        )
         raise ValueError(f"{folder} cannot be made: {error.strerror}{hint}") from None
     args.resume = folder  # should it be interrupted
     try:
@@ -606,16 +618,10 @@ def start_training(args: argparse.Namespace) -> int:
 
 def resume_training(folder: Path, given: dict[str, Any]) -> int:
     """Hold the folder, then read its checkpoint, and go on."""
-    if not (folder / "checkpoint.pt").is_file():
+    if not os.path.isfile(folder / "checkpoint.pt"):
         raise ValueError(f"{folder} holds no checkpoint.pt: give the folder of a training")
     with dqn.lock_folder(folder):
-        for part in folder.glob(".*.part"):  # of a save that was killed
-            part.unlink()
-        for name, mark in (
-            ("best.pt", WEIGHTS),
-            ("config.json", b'{.*"steps"'),
-            ("log.csv", b"step,"),
-        ):
+        for name, mark in RUN_FILES.items():
             if (folder / name).is_symlink():
                 raise ValueError(f"{folder / name} is a link: take it away")
             dqn.check_output(folder / name, mark)
@@ -648,7 +654,7 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
 def load_pilot(args: argparse.Namespace) -> QNetwork:
     """Check all that is given before anything flies, and read the weights. Raises ValueError."""
     for name, low, high in (
-        ("episodes", 1, 10**6), ("first_seed", 0, 10**18), ("threads", 1, CORES)
+        ("episodes", 1, 10**4), ("first_seed", 0, 10**18), ("threads", 1, CORES)
     ):  # fmt: skip
         if not low <= (value := vars(args)[name]) <= high:
             raise ValueError(f"{name} is {value}, allowed are whole numbers from {low} to {high:,}")
@@ -683,11 +689,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         text = "".join(x if x.isprintable() else "?" for x in str(error) or "out of memory")
         text, code = f"deepflight.py: error: {text}", 2 if isinstance(error, ValueError) else 1
     finally:
-        with suppress(OSError):
+        with suppress(OSError, ValueError):  # ValueError: a stream that is closed
             say("", end="")  # what was printed last
     say(text, file=sys.stderr)
     folder = vars(args).get("resume")
-    if code != 2 and folder and (folder / "checkpoint.pt").exists():
+    if code != 2 and folder and os.path.exists(folder / "checkpoint.pt"):
         say(resume_line(folder), file=sys.stderr)
     return code
 

@@ -106,6 +106,7 @@ import hashlib
 import io
 import os
 import re
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -436,6 +437,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     Links are followed to their target, folders made. Raises OSError where that is impossible.
     """
     target = Path(os.path.realpath(path))
+    made = [folder for folder in target.parents if not folder.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
     part = part_file(target, delete=False)
     try:
@@ -448,12 +450,14 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
         os.replace(part.name, target)
     except BaseException:
         os.unlink(part.name)
+        for folder in made:
+            folder.rmdir()
         raise
 
 
 def part_file(target: Path, delete: bool) -> Any:
     """A new file beside a file that is to be written."""
-    folder = next(parent for parent in target.parents if parent.exists())
+    folder = next(parent for parent in target.parents if os.path.lexists(parent))
     name = {"prefix": f".{target.name}.", "suffix": ".part"}
     return NamedTemporaryFile(dir=folder, delete=delete, **name)
 
@@ -493,20 +497,19 @@ def load(path: Path, kind: str) -> dict:
     The digest comes first, because torch.load takes flipped bits for numbers. A file that was made
     on purpose can have the right one. So `check_like` has to look at what this returns.
     """
+    if not os.path.isfile(path) or not 0 < os.path.getsize(path) <= LARGEST:
+        raise ValueError(f"{path} is no file of {kind}, such as train writes to runs/001")
     try:
-        if not path.is_file() or not 0 < path.stat().st_size <= LARGEST:
-            raise ValueError(f"{path} is no file of {kind}, such as train writes to runs/001")
         archive, digest = (data := path.read_bytes())[:-32], data[-32:]
-        if hashlib.sha256(archive).digest() != digest:
-            raise ValueError(f"{path} is damaged, or no file of Deep Flight: its digest is wrong")
-        if sum(x.file_size for x in ZipFile(io.BytesIO(archive)).infolist()) > LARGEST:
-            raise ValueError(f"{path} is larger inside than {LARGEST:,} bytes")
-        content = torch.load(io.BytesIO(archive), weights_only=True)
-    except ValueError:
-        raise
+        whole, content = hashlib.sha256(archive).digest() == digest, None
+        if whole and sum(x.file_size for x in ZipFile(io.BytesIO(archive)).infolist()) <= LARGEST:
+            with warnings.catch_warnings(action="ignore"):  # torch's, of what it will not load
+                content = torch.load(io.BytesIO(archive), weights_only=True)
     except Exception as error:  # such an archive can fail in torch.load in any way
         why = getattr(error, "strerror", None) or type(error).__name__
         raise ValueError(f"{path} cannot be read: {why}") from None
+    if not whole:
+        raise ValueError(f"{path} is damaged, or no file of Deep Flight: its digest is wrong")
     if not isinstance(content, dict) or content.pop("kind", None) != kind:
         raise ValueError(f"{path} holds something else than {kind}")
     return content
@@ -564,12 +567,15 @@ def load_weights(path: Path, actions: int, **world: Any) -> QNetwork:
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
     """Keep other processes out as long as this one is inside, however it ends."""
-    handle = os.open(folder, os.O_RDONLY)
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(f"{folder} is another training's, which still runs") from None
+        handle = os.open(folder, os.O_RDONLY)
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise ValueError(f"{folder} is another training's, which still runs") from None
+    except OSError as error:
+        raise ValueError(f"{folder} cannot be opened: {error.strerror}") from None
+    try:
         yield
     finally:
         os.close(handle)

@@ -441,7 +441,7 @@ def say(text: str, end: str = "\n", file: TextIO | None = None) -> None:
 
 def show(text: str) -> None:
     """Show a passing status on a terminal, over the last one; nothing when piped."""
-    if sys.stdout and sys.stdout.isatty() and os.environ.get("TERM") != "dumb":
+    if getattr(sys.stdout, "isatty", bool)() and os.environ.get("TERM") != "dumb":
         room = shutil.get_terminal_size().columns - 1
         say(f"{text[:room]:{room}}", "\r")
 

@@ -198,15 +198,23 @@ def test_ctrl_c_saves_and_prints_the_command_that_goes_on(
 def test_whatever_is_in_a_folder_that_is_not_ours_stays(
     uninterrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
+    for path in ("x" * 300, "nowhere", str(tmp_path)):
+        assert deepflight.main(["train", "--resume", path]) == 2
     run, mine = tmp_path / "run", tmp_path / "mine.csv"
     mine.write_text("the data of years")
     for name in ("log.csv", "config.json", "best.pt"):
         shutil.copytree(uninterrupted, run, dirs_exist_ok=True)
         (run / name).write_text("notes")
         assert deepflight.main(["train", "--resume", str(run), "--steps", "808"]) == 2
-        assert "did not write it" in capsys.readouterr().err
+        assert "did not write it" in capsys.readouterr().err.splitlines()[-1]
         assert (run / name).read_text() == "notes"
     shutil.copytree(uninterrupted, run, dirs_exist_ok=True)
+    (run / ".thesis.part").write_text("chapter one")
+    (run / ".checkpoint.pt.a1b2c3d4.part").write_text(
+        "half a checkpoint, of a save that was killed"
+    )
+    assert deepflight.main(["train", "--resume", str(run), "--steps", "808"]) == 0
+    assert [path.name for path in run.glob(".*")] == [".thesis.part"]
     (run / "log.csv").unlink()
     (run / "log.csv").symlink_to(mine)
     assert deepflight.main(["train", "--resume", str(run), "--steps", "808"]) == 2
