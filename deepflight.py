@@ -56,6 +56,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import Field, asdict, dataclass, fields
+from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -368,8 +369,6 @@ class Run:
         self.book = {"step": 0, "episodes": 0, "seconds": 0.0, "recent": [], "log": [], "best": []}
         if saved:
             self.restore(saved)
-        bar = fly_random(TESTS, self.fleet.world, np.random.default_rng(0))
-        self.bar = measure(bar)["steps"].mean()  # steps that random flies through the test forests
         folder.mkdir(parents=True, exist_ok=True)
         for part in (part for name in RUN_FILES for part in folder.glob(f".{name}.????????.part")):
             part.unlink()  # of a save that was killed
@@ -437,7 +436,7 @@ class Run:
         flown = {"train": recent, "test": fly(dqn_pilot(q), TESTS, self.fleet.world)}
         for who, flights in flown.items():
             row |= {f"{who}_{key}": x.mean().item() for key, x in measure(flights).items()}
-        row["test_over_random"] = row["test_steps"] / self.bar - 1
+        row["test_over_random"] = row["test_steps"] / random_steps(TESTS, self.fleet.world) - 1
         book["log"] = [*(book["log"] or [",".join(row)]), ",".join(map(str, row.values()))]
         with dqn.whole_file(self.folder / "log.csv") as file:
             file.write("\n".join([*book["log"], ""]).encode())
@@ -513,6 +512,12 @@ def resume_line(folder: Path) -> str:
     return (
         f"to go on:\n{shlex.join([sys.executable, str(script), 'train', '--resume', str(folder)])}"
     )
+
+
+@cache
+def random_steps(seeds: range, world: World) -> float:
+    """How many steps the random pilot flies through these forests in the mean."""
+    return measure(fly_random(seeds, world, np.random.default_rng(0)))["steps"].mean().item()
 
 
 ENDING: list[int] = []  # the signal that ends the program

@@ -252,6 +252,7 @@ def test_a_training_that_nobody_reads_goes_on_and_saves(tmp_path: Path) -> None:
     step = load(tmp_path / "runs/small" / CHECKPOINT, "checkpoint")["book"]["step"]
     assert step == SMALL["steps"]
     line = [sys.executable, str(ROOT / "deepflight.py"), "train", *FLAGS, "--name", "closed"]
+    line += ["--steps", "400"]
     done = subprocess.run(["sh", "-c", f"exec {shlex.join(line)} >&-"], cwd=tmp_path, check=False)
     assert done.returncode == 0
     assert (tmp_path / "runs/closed/best.pt").exists()
