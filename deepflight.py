@@ -163,7 +163,7 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #     run.due(4)        how many multiples of 4 the eight of this pass hold: two updates are due
 #     run.last_share    whether this is the last tenth of all steps
 #     run.note()        counts flights, shows progress
-#     run.test()        flies the test forests, writes log.csv, keeps the best weights in best.pt;
+#     run.test()        flies the test forests, saves, keeps the best weights in best.pt;
 #                       in the last tenth the mean of the weights flies, and is kept
 
 
@@ -220,7 +220,6 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
         run.note()
         if run.due(rc.test_every) or step >= c.steps:
             run.test(epsilon)
-            run.save()
     return run.finish()
 
 
@@ -444,6 +443,7 @@ class Run:
         if late or score > book["best"]:
             book["best"] = score
             dqn.save_weights(self.folder / "best.pt", q, beacon=self.rc.beacon)
+        self.save()  # and then print, which may fail
         say(ROW.format(**row | self.clock))
 
     def content(self) -> dict[str, Any]:

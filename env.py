@@ -435,7 +435,7 @@ def say(text: str, end: str = "\n", file: TextIO | None = None) -> None:
         print(text, end=end, file=file, flush=True)
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
-        if error.errno not in (errno.EPIPE, errno.EIO):
+        if file is not sys.stderr and error.errno not in (errno.EPIPE, errno.EIO):
             raise
 
 
