@@ -578,7 +578,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     sub.add_argument("--first-seed", **more, default=EVAL_FIRST, help=first)
     sub.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
     sub.add_argument("--json", type=place, metavar="FILE", help="write every figure and flight")
-    sub.add_argument("--out", type=place, default="runs/eval", help="folder of the film")
+    sub.add_argument(
+        "--out", type=place, default="runs/eval", help="of the film; default: %(default)s"
+    )
     known = "OMP_NUM_THREADS" in os.environ  # torch has read it
     threads = torch.get_num_threads() if known else RunConfig.threads
     sub.add_argument("--threads", **more, default=threads, help="default: OMP_NUM_THREADS or 2")
