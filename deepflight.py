@@ -145,14 +145,16 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 
 # Textbook DQN, for one drone, without files and tests:
 #
+#     s = the start of a flight
 #     for each step:
 #         a = a random action with probability epsilon, else the a of greatest Q(s, a)
 #         s2, r, end = fly(a)
 #         put s, a, r, s2, end into the replay
+#         s = s2, or if the flight has ended the start of another one
 #         every 4 steps:
-#             s, a, r, s2, end = 32 random transitions of the replay
-#             y = r if end is TERMINAL else r + gamma * max Q^(s2, .)
-#             loss = the mean of (y - Q(s, a))^2
+#             b = 32 random transitions of the replay
+#             y = b.r if b.end is TERMINAL else b.r + gamma * max Q^(b.s2, .)
+#             loss = the mean of (y - Q(b.s, b.a))^2, straight lines beyond an error of 1
 #             move the weights of Q a little against the gradient of the loss
 #             every so many updates: Q^ = Q
 #
@@ -508,10 +510,8 @@ class Run:
 
 def resume_line(folder: Path) -> str:
     """How to go on with a training, from wherever one is."""
-    script, folder = Path(__file__).resolve(), folder.resolve()
-    return (
-        f"to go on:\n{shlex.join([sys.executable, str(script), 'train', '--resume', str(folder)])}"
-    )
+    script, folder = (str(path.resolve()) for path in (Path(__file__), folder))
+    return "to go on:\n" + shlex.join([sys.executable, script, "train", "--resume", folder])
 
 
 @cache
@@ -578,9 +578,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     sub.add_argument("--first-seed", **more, default=EVAL_FIRST, help=first)
     sub.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
     sub.add_argument("--json", type=place, metavar="FILE", help="write every figure and flight")
-    sub.add_argument(
-        "--out", type=place, default="runs/eval", help="of the film; default: %(default)s"
-    )
+    out = "folder of the film; default: %(default)s"
+    sub.add_argument("--out", type=place, default="runs/eval", help=out)
     known = "OMP_NUM_THREADS" in os.environ  # torch has read it
     threads = torch.get_num_threads() if known else RunConfig.threads
     sub.add_argument("--threads", **more, default=threads, help="default: OMP_NUM_THREADS or 2")
@@ -599,19 +598,13 @@ def start_training(args: argparse.Namespace) -> int:
         raise ValueError(f"name is {args.name!r}, allowed are {legal}")
     preset = (BEACON if given.get("beacon") else {}) | (MNIH if args.preset == "mnih" else {})
     c, rc = configure(preset | given)
-    numbers = (Path(f"runs/{i:03d}") for i in range(1, 10**6))
-    folder = (
-        Path("runs") / args.name if args.name else next(p for p in numbers if not os.path.exists(p))
-    )
+    numbers = (f"{i:03d}" for i in range(1, 10**6) if not os.path.exists(f"runs/{i:03d}"))
+    folder = Path("runs", args.name or next(numbers))
     made = [path for path in (folder, folder.parent) if not os.path.exists(path)]
     try:
         folder.mkdir(parents=True)
     except OSError as error:
-        hint = (
-            f"; to go on with it: --resume {folder}"
-            if os.path.exists(folder / "checkpoint.pt")
-            else ""
-        )
+        hint = f"; to go on with it: --resume {folder}" * os.path.exists(folder / "checkpoint.pt")
         raise ValueError(f"{folder} cannot be made: {error.strerror}{hint}") from None
     args.resume = folder  # should it be interrupted
     try:
@@ -648,13 +641,10 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
         env.check_numbers(settings, {f.name: f.metadata["legal"] for f in fields(settings)})
     # The least: three rows to complete a stack, n_steps that wait for rewards, one to draw.
     window = c.num_envs * (c.n_steps + 4)
-    for name, least, rule in (
-        ("replay_size", window, "num_envs * (n_steps + 4)"),
-        ("learning_starts", window, "num_envs * (n_steps + 4)"),
-        ("steps", c.learning_starts + 1, "learning_starts + 1"),
-    ):
-        if (value := getattr(c, name)) < least:
-            raise ValueError(f"{name} is {value}, allowed are numbers from {rule} = {least}")
+    least = {"replay_size": window, "learning_starts": window, "steps": c.learning_starts + 1}
+    for name in least:
+        if (value := getattr(c, name)) < least[name]:
+            raise ValueError(f"{name} is {value}, allowed are whole numbers from {least[name]}")
     return c, rc
 
 
@@ -666,10 +656,8 @@ def load_pilot(args: argparse.Namespace) -> QNetwork:
         if not low <= (value := vars(args)[name]) <= high:
             raise ValueError(f"{name} is {value}, allowed are whole numbers from {low} to {high:,}")
     torch.set_num_threads(args.threads)
-    shipped = (
-        Path(__file__).resolve().parent / "weights" / ("beacon.pt" if args.beacon else "paper.pt")
-    )
-    args.weights = args.weights or shipped
+    shipped = Path(__file__).resolve().parent / "weights"
+    args.weights = args.weights or shipped / ("beacon.pt" if args.beacon else "paper.pt")
     q = dqn.load_weights(args.weights, World.actions, beacon=args.beacon)
     dqn.check_output(args.out / "flight.gif", b"GIF8.*Deep Flight")
     if args.json:

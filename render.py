@@ -27,10 +27,10 @@ ground plane. A camera is 84 rays. A laser scanner is 360 rays. One formula serv
       distance   = along - half_chord             from the eye to the bark
       facing     = half_chord / radius            the cosine of the angle at #: 1 head-on, 0 grazing
 
-    One ray in numbers: a trunk of radius 0.5 m stands 10 m ahead and 0.3 m to the left. The ray
-    that points straight ahead has along = 10 and across = 0.3, so half_chord = 0.4 and the bark is
-    10 - 0.4 = 9.6 m away. The trunk's top is 4 m above the eye and its foot 2 m below. It fills its
-    column from row 41.5 - 42 * 4 / 9.6 = 24.0 down to row 41.5 + 42 * 2 / 9.6 = 50.25.
+    One ray in numbers: a trunk of radius 0.5 m stands 10 m ahead and 0.3 m to the right. The
+    ray that points straight ahead has along = 10 and across = -0.3, so half_chord = 0.4, and the
+    bark is 10 - 0.4 = 9.6 m away. The trunk's top is 4 m above the eye, and its foot 2 m below. It
+    fills its column from row 41.5 - 42 * 4 / 9.6 = 24.0 down to row 41.5 + 42 * 2 / 9.6 = 50.25.
 
 The two rules of a pinhole camera:
   * Column i looks along tan(bearing) = (41.5 - i) / 42, positive to the left. Columns are equally
@@ -110,11 +110,14 @@ def raycast(
     cos, sin, rays = np.cos(bearings), np.sin(bearings), len(bearings)
     along = trunks @ np.array([cos, sin])  # (N, M) m: x * cos + y * sin
     across = trunks @ np.array([-sin, cos])  # (N, M) m: y * cos - x * sin
-    meet = np.flatnonzero(np.abs(across) < radius)  # (H,) trunk * M + ray, of pairs that meet
+    # A pair of a trunk and a ray is one number: trunk * M + ray. A ray of one of E eyes is one
+    # number too, its place: eye * M + ray. With M = 84, pair 700 is trunk 8, ray 28. If eye 1 looks
+    # at trunk 8, the ray's place is 1 * 84 + 28 = 112.
+    meet = np.flatnonzero(np.abs(across) < radius)  # (H,) the pairs that meet
     half_chord = np.sqrt(radius**2 - across.ravel()[meet] ** 2)  # (H,) m
     distance = along.ravel()[meet] - half_chord  # (H,) m, negative: the trunk is behind the eye
     trunk, ray = meet // rays, meet % rays  # (H,), (H,)
-    place = ray if eye is None else eye[trunk] * rays + ray  # (H,) eye 1's rays follow eye 0's
+    place = ray if eye is None else eye[trunk] * rays + ray  # (H,)
     first, facing = np.full(eyes * rays, np.inf), np.zeros(eyes * rays)  # (E * M,), (E * M,)
     np.minimum.at(first, place, np.where(distance > 0, distance, np.inf))  # .at: places may repeat
     nearest = distance == first[place]  # (H,) the hits that are their ray's first

@@ -82,7 +82,8 @@ def test_the_pages_count_how_the_headline_flights_ended() -> None:
         Counter(f["edge"] or f["outcome"] for f in flights(x)) for x in ("paper", "beacon")
     )
     late = np.mean([f["progress"] > 80 for f in flights("paper")])
-    said = f"{paper['side']} left by a side, and {paper['crash']} crashed."
+    said = "{side} left by a side, {back} by the back, {crash} crashed, and {time} ran out of time."
+    said = said.format_map(paper)
     assert f"Of its 1,000 flights {said} It fails late: {late:.0%}"[:-1] + " % of all" in FLAT
     assert f"With the beacon {1000 - beacon['goal']} flights did not arrive" in FLAT
     assert f"and {beacon['crash']} of these crashed" in FLAT
