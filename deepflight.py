@@ -2,7 +2,8 @@
 
     python deepflight.py train                  the default recipe, in the paper's world
     python deepflight.py train --beacon         where a pole makes the goal visible
-    python deepflight.py train --preset mnih    [Mnih15]'s training parameters, eight drones
+    python deepflight.py train --preset dqn     textbook DQN, without our additions
+    python deepflight.py train --preset mnih    [Mnih15]'s training parameters
     python deepflight.py train --resume DIR     go on with an interrupted training
     python deepflight.py eval                   fly weights/paper.pt against three other pilots
     python deepflight.py eval --beacon          fly weights/beacon.pt where the goal is visible
@@ -94,15 +95,19 @@ SETTINGS = (*fields(DQNConfig), *fields(RunConfig))
 # With the beacon the goal can be seen. So no other way out should be worth as much, and
 # flying ahead is not the aim: a pilot that is paid for it passes the goal.
 BEACON = {"forward_reward": 0.0, "far_value": 50.0}
-# [Mnih15, Extended Data Table 1], as the paper says [DF §II-B]. 1.4 M steps are the paper's own.
-# Eight drones still fly side by side. Mnih's table counts the target network's 10,000 in updates.
-# Mnih's code counts steps. We follow the code: 10,000 steps are 2,500 updates.
-MNIH = dict(
-    steps=1_400_000, replay_size=1_000_000, learning_starts=50_000, target_every=2_500,
-    epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, double=False, n_steps=1, mirror=False,
-    huber=1.0, lr_decay=1.0, max_grad_norm=0.0, average=0.0, bfloat16=False, forward_reward=0.0,
-    goal_value=0.0, far_value=0.0,
+# Textbook DQN on the paper's reward, with Adam. Eight drones fly side by side.
+DQN = dict(
+    double=False, n_steps=1, mirror=False, huber=1.0, lr_decay=1.0, max_grad_norm=0.0, average=0.0,
+    forward_reward=0.0, goal_value=0.0, far_value=0.0,
 )  # fmt: skip
+# [Mnih15, Extended Data Table 1], as the paper says [DF §II-B]. 1.4 M steps are the paper's own.
+# Mnih's table counts the target network's 10,000 in updates. Mnih's code counts steps. We follow
+# the code: 10,000 steps are 2,500 updates.
+MNIH = DQN | dict(
+    steps=1_400_000, replay_size=1_000_000, learning_starts=50_000, target_every=2_500,
+    epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, bfloat16=False,
+)  # fmt: skip
+PRESETS = {"default": {}, "dqn": DQN, "mnih": MNIH}
 
 
 # -------------------------------------------------- what the network is paid
@@ -438,6 +443,7 @@ class Run:
         for who, flights in flown.items():
             row |= {f"{who}_{key}": x.mean().item() for key, x in measure(flights).items()}
         row["test_over_random"] = row["test_steps"] / random_steps(TESTS, self.fleet.world) - 1
+        row["seconds"] = round(book["seconds"], 1)
         book["log"] = [*(book["log"] or [",".join(row)]), ",".join(map(str, row.values()))]
         with dqn.whole_file(self.folder / "log.csv") as file:
             file.write("\n".join([*book["log"], ""]).encode())
@@ -548,8 +554,8 @@ def place(text: str) -> Path:
 def describe(f: Field) -> str:
     """The help of a setting's flag: what it is, what is allowed, what the presets make of it."""
     legal = "{:,g} to {:,g}".format(*f.metadata["legal"]) if f.type is not bool else "true or false"
-    presets = (("mnih", MNIH), ("beacon", BEACON))
-    changes = [f"; {name} {preset[f.name]}" for name, preset in presets if f.name in preset]
+    presets = PRESETS | {"beacon": BEACON}
+    changes = [f"; {name} {presets[name][f.name]}" for name in presets if f.name in presets[name]]
     return f"{f.metadata['help']} ({legal}; default {f.default}{''.join(changes)})"
 
 
@@ -559,7 +565,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     commands = parser.add_subparsers(metavar="train or eval", required=True)
     sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
     sub.set_defaults(run=start_training, preset="default", name=None, resume=None)
-    sub.add_argument("--preset", choices=("default", "mnih"), help="mnih: [Mnih15]'s parameters")
+    kinds = "dqn: textbook DQN; mnih: with [Mnih15]'s parameters"
+    sub.add_argument("--preset", choices=PRESETS, metavar="NAME", help=kinds)
     sub.add_argument("--name", help="name of the folder in runs/; by default a new number")
     sub.add_argument("--resume", type=place, help="folder of a training to go on with")
     for f in SETTINGS:
@@ -596,7 +603,7 @@ def start_training(args: argparse.Namespace) -> int:
     if args.name is not None and not re.fullmatch(r"\w[\w.-]{0,99}", args.name, re.ASCII):
         legal = "100 of a-z, A-Z, 0-9, dot, dash, underscore; the first no dot or dash"
         raise ValueError(f"name is {args.name!r}, allowed are {legal}")
-    preset = (BEACON if given.get("beacon") else {}) | (MNIH if args.preset == "mnih" else {})
+    preset = (BEACON if given.get("beacon") else {}) | PRESETS[args.preset]
     c, rc = configure(preset | given)
     numbers = (f"{i:03d}" for i in range(1, 10**6) if not os.path.exists(f"runs/{i:03d}"))
     folder = Path("runs", args.name or next(numbers))

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import pickle
+import re
 import subprocess
 import sys
 from dataclasses import asdict, fields
@@ -17,6 +18,7 @@ import torch
 import deepflight
 from deepflight import (
     BEACON,
+    DQN,
     MNIH,
     RunConfig,
     configure,
@@ -120,8 +122,8 @@ def test_the_help_says_what_is_allowed_and_what_a_preset_changes(
         assert stop.value.code == 0
     text = capsys.readouterr().out
     assert "control steps in all (1 to 1e+09; default 300000; mnih 1400000)" in text
-    assert "(-1e+06 to 1e+06; default 200.0; mnih 0.0; beacon 50.0)" in text
-    assert "(true or false; default True; mnih False)" in text
+    assert "(-1e+06 to 1e+06; default 200.0; dqn 0.0; mnih 0.0; beacon 50.0)" in text
+    assert "(true or false; default True; dqn False; mnih False)" in text
     assert "default: 2000000000" in text
 
 
@@ -131,9 +133,7 @@ def test_every_piece_that_is_not_in_the_textbook_has_one_setting_that_switches_i
     source = "".join((ROOT / name).read_text() for name in ("deepflight.py", "dqn.py"))
     for name in extras.keys() - {"huber_after"}:  # it belongs to huber
         assert f"[+{name}]" in source, f"{name} is marked where it happens"
-    off = dict(adam=False, num_envs=1, double=False, n_steps=1, mirror=False, huber=1.0)
-    off |= dict(lr_decay=1.0, max_grad_norm=0.0, average=0.0, bfloat16=False)
-    off |= dict(forward_reward=0.0, goal_value=0.0, far_value=0.0)
+    off = DQN | dict(adam=False, num_envs=1, bfloat16=False)
     assert extras.keys() - {"huber_after"} == off.keys()
     configure(off)  # all of them at once are a legal training: plain DQN
 
@@ -347,7 +347,9 @@ def test_twenty_seconds_of_training_through_the_real_command_line(tmp_path: Path
     assert (run / "log.csv").read_bytes() == log
 
     command("train", "--steps", 800, *SHORT, folder=tmp_path)
-    assert (tmp_path / "runs/001/log.csv").read_bytes() == log, "same seed, same bytes"
+    same = (tmp_path / "runs/001/log.csv").read_bytes()
+    clock = rb",[\w.]+\n"  # the last column, seconds
+    assert re.sub(clock, b"", same) == re.sub(clock, b"", log), "same seed, same bytes"
 
 
 # -------------------------------------------------- eval
