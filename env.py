@@ -389,9 +389,10 @@ def dynamic_window(bearings: ndarray, distances: ndarray, goal_bearing: float, w
     # In the drone's axes a point is the complex number x + iy.
     points = (distances * np.exp(1j * bearings))[distances < world.laser_range]  # (P,) m
     rates = world.yaw_rate * np.linspace(-1, 1, world.actions)  # (A,) rad/s
-    headings = rates[:, None] * world.dt * np.arange(1, 16)  # (A, 15) rad
-    arcs = np.cumsum(world.speed * world.dt * np.exp(1j * headings), 1)  # (A, 15) m
-    clearance = np.abs(arcs[..., None] - points).min(-1, initial=world.laser_range)  # (A, 15) m
+    times = world.dt * np.arange(1, max(round(1.5 / world.dt), 1) + 1)  # (T,) s
+    headings = rates[:, None] * times  # (A, T) rad
+    arcs = np.cumsum(world.speed * world.dt * np.exp(1j * headings), 1)  # (A, T) m
+    clearance = np.abs(arcs[..., None] - points).min(-1, initial=world.laser_range)  # (A, T) m
     safe = np.logical_and.accumulate(clearance >= 0.8, 1).sum(1) * world.dt  # (A,) s
     error = np.abs(np.angle(np.exp(1j * (goal_bearing - headings[:, -1]))))  # (A,) rad, wrapped
     return int(np.argmax(10 * safe + 2 * np.minimum(clearance.min(1), 2) - 4 * error))

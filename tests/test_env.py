@@ -410,7 +410,12 @@ def test_in_the_open_the_laser_pilot_turns_to_the_goal() -> None:
     assert dynamic_window(*OPEN, 0.0, WORLD) == 4
     assert dynamic_window(*OPEN, 2.0, WORLD) == 8
     assert dynamic_window(*OPEN, -2.0, WORLD) == 0
-    assert dynamic_window(*OPEN, 0.35 * 1.5, WORLD) == 6  # 0.35 rad/s for 1.5 s
+
+
+def test_the_laser_pilot_looks_one_and_a_half_seconds_ahead_at_any_control_rate() -> None:
+    for rate in (10, 30, 50):
+        world = World(dt=1 / rate)
+        assert dynamic_window(*OPEN, 0.35 * 1.5, world) == 6, "0.35 rad/s for 1.5 s"
 
 
 def test_the_laser_pilot_turns_away_from_a_trunk_ahead() -> None:

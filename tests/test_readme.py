@@ -147,6 +147,19 @@ def test_the_clock_on_the_pages_is_the_measured_one() -> None:
     assert f"after {clock['median']:.0f} s and {steps:,} steps" in LONG
 
 
+def test_the_flights_at_three_control_rates_are_what_was_measured() -> None:
+    x = report("clock_rate")
+    steps, over = (
+        [x[rate][pilot][key]["value"] for rate in ("10", "30", "50")]
+        for pilot, key in (("random", "steps"), ("laser", "over_random"))
+    )
+    said = "lasts {:.1f} steps here at 10 Hz, {:.1f} at 30 Hz and {:.1f} at 50 Hz"
+    assert said.format(*steps) in LONG
+    assert "is {:+.0%} at 10 Hz, {:+.0%} at 30 Hz and {:+.0%} at 50 Hz".format(*over) in (
+        LONG.replace(" %", "%")
+    )
+
+
 def test_each_ratio_of_the_benchmark_is_on_the_long_page() -> None:
     for name, figure in report("bench")["figures"].items():
         assert f"| {name} | {figure:.2f} |" in RESULTS

@@ -1,0 +1,150 @@
+"""What is each piece of the recipe worth? A ladder from textbook DQN to the pilot, a flag a rung.
+
+    extras/.venv/bin/python -m extras.experiments.ladder train   # hours; the same command goes on
+    extras/.venv/bin/python -m extras.experiments.ladder fly     # minutes; what is trained so far
+    extras/.venv/bin/python -m extras.experiments.ladder draw
+
+`train` trains every rung with two seeds for 100,000 steps, each on one thread, two at a time, in
+runs/ladder-RUNG-SEED. Beside the rungs it trains the controls: the whole recipe with another loss
+or learning rate. `fly` flies the best.pt of each through 200 forests that no training, test or
+evaluation uses, writes results/ladder.json, and copies logs and settings to results/ladder/. `draw`
+draws figures/ladder.png: a row a rung, a dot a seed, with its 95 % interval over the forests.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from deepflight import RunConfig, dqn_pilot, summarize
+from dqn import DQNConfig, load_weights
+from env import World, fly, fly_random
+
+ROOT = Path(__file__).parents[2]
+STEPS, SEEDS = 100_000, (0, 1)
+FORESTS = range(4 * 10**9, 4 * 10**9 + 200)
+
+
+def back(*names: str) -> list[str]:
+    """The flags that set these settings back from a preset's value to the default."""
+    flags: list[str] = []
+    for name in names:
+        value, flag = getattr(DQNConfig if hasattr(DQNConfig, name) else RunConfig, name), "--"
+        flag += name.replace("_", "-")
+        flags += [flag] if value is True else [flag, str(value)]
+    return flags
+
+
+# name -> the flags that it adds to the rungs above it
+RUNGS = {
+    "1 textbook DQN": ["--preset", "dqn"],
+    "2 + Double": back("double"),
+    "3 + five-step returns": back("n_steps"),
+    "4 + mirror images": back("mirror"),
+    "5 + loss and learning rate": back("huber", "lr_decay", "max_grad_norm"),
+    "6 + mean of the weights": back("average"),
+    "7 + pay for crossing": back("forward_reward", "goal_value", "far_value"),
+}
+CONTROLS = {
+    "huber 1": ["--huber", "1"],
+    "huber 1, no clipping": ["--huber", "1", "--max-grad-norm", "0"],
+    "huber 1, a quarter of lr": ["--huber", "1", "--lr", "6e-5"],
+    "huber 10 throughout": ["--huber", "10", "--huber-after", "0"],
+    "huber 100 throughout": ["--huber", "100", "--huber-after", "0"],
+    "huber 100, twice the lr": ["--huber", "100", "--huber-after", "0", "--lr", "5e-4"],
+}
+
+
+def trainings() -> Iterator[tuple[str, str, int, list[str]]]:
+    """Of every training: its folder's name, its label, its seed and its flags."""
+    flags: list[str] = []
+    for label, more in RUNGS.items():
+        flags = flags + more
+        for seed in SEEDS:
+            yield f"ladder-{label[0]}-{seed}", label, seed, flags
+    for i, (label, more) in enumerate(CONTROLS.items()):
+        yield f"ladder-{'abcdefgh'[i]}-0", label, 0, more
+
+
+def train(training: tuple[str, str, int, list[str]]) -> None:
+    """Train, or go on where an interrupted training stands, or do nothing if it is done."""
+    name, label, seed, flags = training
+    folder = ROOT / "runs" / name
+    words = ["--name", name, "--steps", str(STEPS), "--threads", "1", "--seed", str(seed), *flags]
+    if (folder / "checkpoint.pt").exists():
+        if (folder / "log.csv").read_text().splitlines()[-1].startswith(f"{STEPS},"):
+            return
+        words = ["--resume", str(folder)]
+    print(f"{name}: {label}", flush=True)
+    line = [sys.executable, str(ROOT / "deepflight.py"), "train", *words]
+    subprocess.run(line, cwd=ROOT, stdout=subprocess.DEVNULL, check=True)
+
+
+def fly_all() -> None:
+    """Fly whatever is trained, write the figures, keep logs and settings."""
+    world, rng = World(), np.random.default_rng(0)
+    bar = fly_random(FORESTS, world, rng)
+    draws = rng.integers(len(FORESTS), size=(2000, len(FORESTS)))  # (2000, forests)
+    report: dict[str, dict[str, dict]] = {}
+    for name, label, seed, _ in trainings():
+        folder = ROOT / "runs" / name
+        if not (folder / "best.pt").exists():
+            continue
+        q = load_weights(folder / "best.pt", World.actions, beacon=False)
+        figures = summarize(fly(dqn_pilot(q), FORESTS, world), bar, draws)
+        report.setdefault(label, {})[str(seed)] = figures
+        (kept := ROOT / "results/ladder" / name.removeprefix("ladder-")).mkdir(
+            parents=True, exist_ok=True
+        )
+        for file in ("log.csv", "config.json"):
+            shutil.copy(folder / file, kept / file)
+        said = {key: f"{figures[key]['value']:.2f}" for key in ("over_random", "return", "crossed")}
+        print(f"{label}, seed {seed}: {said}", flush=True)
+    (ROOT / "results/ladder.json").write_text(json.dumps(report, indent=1) + "\n")
+
+
+def draw() -> None:
+    """Three panels, a row a rung, its seeds one above the other."""
+    report = json.loads((ROOT / "results/ladder.json").read_text())
+    panels = {"over_random": "flight time over random, %", "return": "return by the paper's reward"}
+    panels["crossed"] = "crossed, %"
+    figure, axes = plt.subplots(1, 3, figsize=(12, 4), sharey=True, layout="constrained")
+    for panel, (key, title) in zip(axes, panels.items(), strict=True):
+        factor = 1 if key == "return" else 100
+        for row, label in enumerate(RUNGS):
+            for seed, figures in report.get(label, {}).items():
+                value, low, high = (factor * figures[key][x] for x in ("value", "low", "high"))
+                y, colour = row + 0.2 * int(seed) - 0.1, f"C{seed}"
+                panel.plot([low, high], [y, y], colour, linewidth=1)
+                panel.plot(value, y, "o", color=colour)
+        panel.set_title(title, fontsize=11)
+        panel.grid(alpha=0.3)
+    axes[0].set_yticks(range(len(RUNGS)), RUNGS)
+    axes[0].invert_yaxis()
+    figure.savefig(ROOT / "figures/ladder.png", dpi=100)
+    print("wrote figures/ladder.png")
+
+
+def main() -> None:
+    """One of the three commands."""
+    command = sys.argv[1] if len(sys.argv) == 2 else ""
+    if command == "train":
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(train, trainings()))
+    elif command in ("fly", "draw"):
+        {"fly": fly_all, "draw": draw}[command]()
+    else:
+        sys.exit(f"ladder: the command is {sys.argv[1:]}, allowed are train, fly and draw")
+
+
+if __name__ == "__main__":
+    main()
