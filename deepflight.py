@@ -221,7 +221,7 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
             agent.updates += 1
             if agent.updates % c.target_every == 0:
                 agent.q_target.load_state_dict(agent.q.state_dict())  # 15
-            if run.last_share:  # [+average] Q's flying jumps with every update; a mean is steady
+            if run.last_share:  # [+average] every update changes how Q flies; a mean is steady
                 agent.mean.update_parameters(agent.q)
 
         run.note()
@@ -355,12 +355,14 @@ def track(flight: dict[str, Any], world: World) -> tuple[ndarray, str]:
 HEAD = "     step  eps    /s left reward |  test longer cross crash"
 ROW = "{step:9,}{epsilon:5.2f}{speed:6.0f}{eta:5.0f}{train_return:7.1f} |{test_return:6.1f}"
 ROW += "{test_over_random:z7.0%}{test_crossed:6.0%}{test_crash:6.0%}"
-WEIGHTS = b"PK.*weights"  # how a file of dqn.save_weights begins
+WEIGHTS = rb"PK.*kind.*weights.*network.*conv\.0\.weight"  # how dqn.save_weights begins a file
 RUN_FILES = {  # of a run's folder, and how each begins
-    "best.pt": WEIGHTS, "config.json": rb'\{\s*"steps": \d', "log.csv": b"step,episodes,updates,",
-    "checkpoint.pt": b"PK.*checkpoint",
+    "best.pt": WEIGHTS, "config.json": rb'\{\s*"steps": \d+,\s*"gamma": .*"beacon": .*"far_value"',
+    "log.csv": b"step,episodes,updates,epsilon,train_steps,.*,test_over_random",
+    "checkpoint.pt": b"PK.*kind.*checkpoint.*settings.*steps.*gamma",
 }  # fmt: skip
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, kill, a closed terminal
+# Ctrl-C, kill, a closed terminal, Ctrl-\, a limit on the processor's time
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGXCPU)
 
 
 class Run:
@@ -457,7 +459,7 @@ class Run:
     def content(self) -> dict[str, Any]:
         """What a checkpoint holds: 34 MB; of the replay only each flight's seed and actions."""
         content = {"settings": asdict(self.c) | asdict(self.rc), "machine": dqn.MACHINE}
-        content |= {"agent": self.agent.state_dict(), "rng": self.rng.bit_generator.state}
+        content |= {"agent": dict(self.agent.state_dict()), "rng": self.rng.bit_generator.state}
         return content | {"flights": self.fleet.record(self.replay.rows), "book": self.book}
 
     def save(self) -> None:
@@ -605,22 +607,27 @@ def start_training(args: argparse.Namespace) -> int:
         raise ValueError(f"name is {args.name!r}, allowed are {legal}")
     preset = (BEACON if given.get("beacon") else {}) | PRESETS[args.preset]
     c, rc = configure(preset | given)
-    numbers = (f"{i:03d}" for i in range(1, 10**6) if not os.path.exists(f"runs/{i:03d}"))
+    numbers = (f"{i:03d}" for i in range(1, 10**6) if not os.path.lexists(f"runs/{i:03d}"))
     folder = Path("runs", args.name or next(numbers))
     made = [path for path in (folder, folder.parent) if not os.path.exists(path)]
     try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        hint = f"; to go on with it: --resume {folder}" * os.path.exists(folder / "checkpoint.pt")
-        raise ValueError(f"{folder} cannot be made: {error.strerror}{hint}") from None
-    args.resume = folder  # should it be interrupted
-    try:
+        make_folder(folder)
+        args.resume = folder  # should it be interrupted
         with dqn.lock_folder(folder):
             return train(c, rc, folder)
     finally:
         for path in made:
             with suppress(OSError):  # something has been saved there
                 path.rmdir()
+
+
+def make_folder(folder: Path) -> None:
+    """Make a run's folder. Raises ValueError where that cannot be done."""
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        hint = f"; to go on with it: --resume {folder}" * os.path.exists(folder / "checkpoint.pt")
+        raise ValueError(f"{error.filename} cannot be made: {error.strerror}{hint}") from None
 
 
 def resume_training(folder: Path, given: dict[str, Any]) -> int:
@@ -680,8 +687,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     args, text, code = argparse.Namespace(), "", 0
     ENDING.clear()
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # a name that cannot be printed is no trouble
-            stream.reconfigure(errors="backslashreplace")
+        if hasattr(stream, "reconfigure"):  # names of files are printed as the bytes that they are
+            stream.reconfigure(encoding=sys.getfilesystemencoding(), errors="surrogateescape")
     try:
         args = parse(argv)
         return args.run(args)
@@ -691,6 +698,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         text = "".join(x if x.isprintable() else "?" for x in str(error) or "out of memory")
         text, code = f"deepflight.py: error: {text}", 2 if isinstance(error, ValueError) else 1
     finally:
+        ENDING.append(0)  # from here on signals change nothing
         with suppress(OSError, ValueError):  # ValueError: a stream that is closed
             say("", end="")  # what was printed last
     say(text, file=sys.stderr)
@@ -704,4 +712,7 @@ if __name__ == "__main__":
     for number in STOPS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, stop_at_once)
-    sys.exit(main())
+    code = main()
+    for number in STOPS:
+        signal.signal(number, signal.SIG_IGN)  # the end has begun already
+    sys.exit(code)

@@ -1,12 +1,15 @@
 """dqn.py: the brain. Deep Q-learning (DQN), the algorithm of [Mnih15].
 
 The words, for this drone
-    state s       what the drone knows: its last four pictures
+    state s       what the drone knows: its last four pictures. One shows where the trunks are, and
+                  four show how they move
     action a      one of nine yaw rates, chosen ten times a second
     reward r      one number a step, good or bad
     transition    one step of experience: state s, action a, reward r, next state s2
-    return        all rewards to come, added up; a reward k steps away counts gamma^k times
-    gamma         the discount, 0.99. Three rewards 1, 1, -10 and then the end: the return is
+    return        all rewards to come, added up; a reward k steps away counts gamma^k times. (Tables
+                  and logs add up a flight's rewards without gamma.)
+    gamma         the discount, 0.99. It makes soon worth more than late, and keeps the sum of
+                  endless rewards finite. Three rewards 1, 1, -10 and then the end: the return is
                   1 + 0.99 * 1 + 0.99^2 * -10 = 1 + 0.99 - 9.80 = -7.81
 
 Q(s, a) is the expected return of a drone that takes action a in state s, and the best action in
@@ -82,8 +85,9 @@ mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, 
     values.gather(1, a[:, None])[:, 0]      in NumPy: values[arange(len(a)), a]
 
 A mark like [+double] means: not in the textbook. The name is the setting that switches it off. As
-textbook we also count a limit of [Mnih15] to line 14: the loss grows in a straight line beyond an
-error of 1, so that large errors do not pull harder than that.
+textbook we also count a limit of [Mnih15] to line 14. Up to an error of 1 the loss is half its
+square. Beyond that the loss is a straight line, so that a large error pulls no harder than an error
+of 1. [Mnih15] also cuts rewards to [-1, 1]. We do not, because -10 is not -1.
 
 Legend
     s, a      state and action
@@ -108,7 +112,7 @@ import os
 import re
 import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -199,7 +203,8 @@ class QNetwork(nn.Module):
 
 @torch.no_grad()
 def greedy(q: QNetwork, s: ndarray) -> ndarray:
-    """The actions (B,) of greatest value in the states s (B, 4, 84, 84) uint8 (line 8)."""
+    """The actions (B,) of greatest value in the states s (B, 4, 84, 84) uint8 (line 8). A pilot
+    that always takes these is called greedy."""
     return q(torch.from_numpy(s)).argmax(1).numpy()
 
 
@@ -436,30 +441,27 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
     Links are followed to their target, folders made. Raises OSError where that is impossible.
     """
-    target = Path(os.path.realpath(path))
+    target, part = Path(os.path.realpath(path)), None
     made = [folder for folder in target.parents if not folder.exists()]
-    target.parent.mkdir(parents=True, exist_ok=True)
-    part = part_file(target, delete=False)
+    name = {"prefix": f".{target.name}.", "suffix": ".part"}
     try:
-        with part:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with NamedTemporaryFile(dir=target.parent, delete=False, **name) as part:
             yield part
             part.flush()
             os.fsync(part.fileno())
         os.umask(umask := os.umask(0))
         os.chmod(part.name, 0o666 & ~umask)
         os.replace(part.name, target)
-    except BaseException:
-        os.unlink(part.name)
+    except BaseException as error:
+        if isinstance(error, OSError):
+            error.filename = error.filename or str(path)  # a full disk does not name it
+        if part:
+            os.unlink(part.name)
         for folder in made:
-            folder.rmdir()
+            with suppress(OSError):  # it was not made
+                folder.rmdir()
         raise
-
-
-def part_file(target: Path, delete: bool) -> Any:
-    """A new file beside a file that is to be written."""
-    folder = next(parent for parent in target.parents if os.path.lexists(parent))
-    name = {"prefix": f".{target.name}.", "suffix": ".part"}
-    return NamedTemporaryFile(dir=folder, delete=delete, **name)
 
 
 def check_output(path: Path, mark: bytes) -> None:
@@ -468,9 +470,9 @@ def check_output(path: Path, mark: bytes) -> None:
     try:
         target = Path(os.path.realpath(path))
         if os.path.lexists(target) and not re.match(mark, head(target), re.DOTALL):
-            raise ValueError(f"{path} exists, and this program did not write it: name another file")
-        with part_file(target, delete=True):
-            pass  # so a file can be made there
+            raise ValueError(f"{path} exists, and this program did not write it: move it away")
+        with suppress(EOFError), whole_file(path):
+            raise EOFError  # a rehearsal: nothing of it stays
     except OSError as error:
         raise ValueError(f"{path} cannot be written: {error.strerror}") from None
 
@@ -534,9 +536,10 @@ def check_like(found: Any, like: Any, where: object) -> None:
         for trait in ("dtype", "layout", "device", "shape"):
             if (a := getattr(found, trait)) != (b := getattr(like, trait)):
                 raise ValueError(f"{where} is a tensor of {trait} {a}, not {b}")
-    numbers = isinstance(like, Tensor | float) and not torch.as_tensor(found).isfinite().all()
-    if numbers or (isinstance(like, int) and not 0 <= found < 2**128):
-        raise ValueError(f"{where} is no number that can be: not finite, negative or too large")
+    if isinstance(like, Tensor | float) and not torch.isfinite(torch.as_tensor(found)).all():
+        raise ValueError(f"{where} holds a number that is not finite")
+    if isinstance(like, int) and not 0 <= found < 2**128:
+        raise ValueError(f"{where} is a number below 0 or beyond 2^128")
     if isinstance(like, str) and not found.isascii():
         raise ValueError(f"{where} is no text of ours")
 

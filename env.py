@@ -12,8 +12,8 @@
 
 The drone never slows down. Ten times a second it takes a picture, keeps the last four, and picks
 one of nine yaw rates: 0 is the sharpest right turn, 4 is straight on, 8 is the sharpest left turn.
-Each such step earns one number, the reward. It says how good the step was, and nothing else tells
-the drone what to do. To fly well is to collect much reward over a whole flight.
+Each such step earns one number, the reward. It says how good the step was. To fly well is to
+collect much reward over a whole flight.
 
     | the step ends                        | the reward is                                       |
     |--------------------------------------|-----------------------------------------------------|
@@ -30,9 +30,9 @@ One step in numbers: the drone is at x = 30 on the middle line, so d_goal = 60, 
 is 1.5 m away. That is too close: -5 * (2.0 - 1.5) / (2.0 - 0.75) = -2. A third of the way is made:
 1 - 60 / 90 = 0.33. The reward of the step is -1.67.
 
-This is the paper's reward. To leave by the far edge costs 10 too, although it is what a pilot that
-cannot see the goal should do. So the network is paid more than this: see `learner_reward` in
-deepflight.py.
+This is the paper's reward. By it, leaving by the far edge costs 10 too. But the goal stands there,
+and a pilot that cannot see the goal can do no better than to cross the forest. So in training the
+network is paid more than this: see `learner_reward` in deepflight.py.
 
 A flight ends in one of two ways. It is **terminated** when the world itself ends it: by a crash, by
 arrival, or by leaving the forest. No more reward can follow. It is **truncated** when only the
@@ -155,8 +155,8 @@ def grid(world: World) -> ndarray:
 class ForestEnv:
     """One drone, one forest, a new one every flight; Gymnasium 1.x signatures.
 
-    Observation: (4, 84, 84) uint8, oldest picture first, the first one repeated at reset. Who
-    writes into it changes no later observation.
+    Observation: (4, 84, 84) uint8, oldest picture first, the first one repeated at reset. It is a
+    copy, so writing into it changes nothing here.
     Action: an int, 0 turns right at 0.7 rad/s, 4 flies straight, 8 turns left.
     `camera=False` leaves the pictures black, for pilots that look at nothing or at the laser.
     """
@@ -176,7 +176,7 @@ class ForestEnv:
         """Plant forest number `seed`, or the one after the last, and stand at the start.
 
         Uses no random generator: the forest is a function of the seed. `options` is unused. Raises
-        ValueError if the seed is no whole number from 0. Then no flight is in the air.
+        ValueError unless the seed is a whole number, 0 or more. After that no flight is in the air.
         """
         self.place(self.seed + 1 if seed is None else seed)
         self.observation = np.repeat(look([self]), STACK, 0)  # (4, 84, 84)
@@ -443,7 +443,7 @@ def say(text: str, end: str = "\n", file: TextIO | None = None) -> None:
 def show(text: str) -> None:
     """Show a passing status on a terminal, over the last one; nothing when piped."""
     if getattr(sys.stdout, "isatty", bool)() and os.environ.get("TERM") != "dumb":
-        room = shutil.get_terminal_size().columns - 1
+        room = min(shutil.get_terminal_size().columns, 999) - 1
         say(f"{text[:room]:{room}}", "\r")
 
 

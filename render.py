@@ -48,7 +48,7 @@ Legend
     E  eyes that look at the same time, one for each drone
     H  hits: pairs of a ray and a trunk that meet
     x, y       metres; in the drone's own axes x is ahead and y is left
-    bearing    rad, counter-clockwise from the drone's heading
+    bearing    rad, counter-clockwise from the x axis of whoever looks
     grey       0 is black, 255 is white
     [DF]       the Deep Flight paper, [Mnih15] the Nature paper on DQN
 
@@ -100,7 +100,8 @@ def raycast(
     """Find what each ray hits first.
 
     trunks (N, 2): centres relative to the eye that looks, m. radius: m. bearings (M,): rad, the
-    same for every eye. eye (N,): which of several eyes looks at which trunk.
+    same for every eye. Where several eyes look, each has its own forest, and `trunks` holds all of
+    them: eye (N,) is the number of each trunk's eye.
     Returns the rays of the first eye, then those of the next: distance (E * M,), m along the ray,
     inf where it hits nothing, and facing (E * M,), 0 where it hits nothing.
 
@@ -126,7 +127,8 @@ def raycast(
 
 
 def fade(grey: ndarray, distance: ndarray, scene: Scene) -> ndarray:
-    """Mix a grey level with the sky's, the more the farther: where the view ends all is haze."""
+    """Mix a grey level with the sky's. The share of the sky grows with distance, to 1 where the
+    view ends."""
     return scene.sky + (grey - scene.sky) * np.maximum(1 - distance / scene.view, 0)
 
 

@@ -268,6 +268,8 @@ eval --json link
 eval --json runs/eval/flight.gif
 eval --json text.pt/x.json
 eval --json LONG
+eval --json new/LONG/new
+eval --out new/LONG/new
 eval --json diary
 eval --json o --out o
 eval --json o/flight.gif/r.json --out o
@@ -305,8 +307,8 @@ def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
     before = sorted(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
     for line in lines:
-        odd = {"EMPTY": "", "HUGE": "9" * 400, "LONG": "x" * 300}
-        code = deepflight.main([odd.get(word, word) for word in line.split(" ") if word])
+        words = line.replace("HUGE", "9" * 400).replace("LONG", "x" * 300).split(" ")
+        code = deepflight.main(["" if word == "EMPTY" else word for word in words if word])
         out, error = capsys.readouterr()
         assert code == 2, line
         assert error.count("\n") == 1, line

@@ -17,6 +17,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -207,12 +208,16 @@ def test_whatever_is_in_a_folder_that_is_not_ours_stays(
         assert deepflight.main(["train", "--resume", path]) == 2
     run, mine = tmp_path / "run", tmp_path / "mine.csv"
     mine.write_text("the data of years")
-    for name in ("log.csv", "config.json", "best.pt"):
+    others = {"log.csv": "step,episodes,updates,my_notes", "config.json": '{"steps": 5}'}
+    torch.save({"kind": "mine", "weights": torch.ones(3)}, tmp_path / "theirs.pt")
+    others = {name: text.encode() for name, text in others.items()}
+    others["best.pt"] = (tmp_path / "theirs.pt").read_bytes()
+    for name, data in others.items():
         shutil.copytree(uninterrupted, run, dirs_exist_ok=True)
-        (run / name).write_text("notes")
+        (run / name).write_bytes(data)
         assert deepflight.main(["train", "--resume", str(run), "--steps", "808"]) == 2
         assert "did not write it" in capsys.readouterr().err.splitlines()[-1]
-        assert (run / name).read_text() == "notes"
+        assert (run / name).read_bytes() == data
     shutil.copytree(uninterrupted, run, dirs_exist_ok=True)
     (run / ".thesis.part").write_text("chapter one")
     (run / ".checkpoint.pt.a1b2c3d4.part").write_text(
@@ -224,6 +229,16 @@ def test_whatever_is_in_a_folder_that_is_not_ours_stays(
     (run / "log.csv").symlink_to(mine)
     assert deepflight.main(["train", "--resume", str(run), "--steps", "808"]) == 2
     assert mine.read_text() == "the data of years"
+
+
+def test_a_signal_after_the_work_changes_nothing(tmp_path: Path) -> None:
+    process = start("eval", "--episodes", 1, "--pilots", "random", folder=tmp_path)
+    for line in process.stdout:
+        while "flight.gif" in line and process.poll() is None:
+            for number in deepflight.STOPS:
+                process.send_signal(number)
+    assert process.stderr.read() == ""
+    assert process.returncode == 0
 
 
 def test_ctrl_c_held_down_is_no_traceback_and_leaves_nothing(tmp_path: Path) -> None:
@@ -239,7 +254,7 @@ def test_ctrl_c_held_down_is_no_traceback_and_leaves_nothing(tmp_path: Path) -> 
         assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", deepflight.STOPS[1:])
 def test_a_kill_and_a_closed_terminal_save_too(number: signal.Signals, tmp_path: Path) -> None:
     process = start("train", *FLAGS, "--steps", 10**6, "--name", "small", folder=tmp_path)
     flies(process)
@@ -442,11 +457,19 @@ def test_a_malicious_checkpoint_runs_nothing(
 # -------------------------------------------------- what an attacker signs
 
 
+def odd_attributes() -> object:
+    """A dictionary whose own `keys` hides the method: torch.load keeps such attributes."""
+    odd = OrderedDict()
+    odd.__dict__["keys"] = 5
+    return odd
+
+
 def odd_thing(rng: np.random.Generator) -> object:
     """Something that no file of ours holds where it will stand."""
     size = rng.integers(0, 4, size=rng.integers(0, 4)).tolist()
     things = [
         *(None, True, -1, 2**200, 0.5, math.nan, math.inf, "x", b"x", [], {}, (), [[[]]], {1: "x"}),
+        *(OrderedDict(), odd_attributes()),
         *(torch.zeros(size), torch.full(size, math.nan), torch.zeros(3136, 512).to_sparse()),
         *(torch.zeros(size, dtype=x) for x in (torch.int8, torch.float16, torch.complex64)),
         torch.zeros(1).expand(512, 3136),
