@@ -1,14 +1,16 @@
-"""What is each piece of the recipe worth? A ladder from textbook DQN to the pilot, a flag a rung.
+"""What is each piece of the recipe worth? A ladder from [Mnih15] to the pilot, a flag a rung.
 
     extras/.venv/bin/python -m extras.experiments.ladder train   # hours; the same command goes on
     extras/.venv/bin/python -m extras.experiments.ladder fly     # minutes; what is trained so far
     extras/.venv/bin/python -m extras.experiments.ladder draw
 
-`train` trains every rung with two seeds for 100,000 steps, each on one thread, two at a time, in
-runs/ladder-RUNG-SEED. Beside the rungs it trains the controls: the whole recipe with another loss
-or learning rate. `fly` flies the best.pt of each through 200 forests that no training, test or
-evaluation uses, writes results/ladder.json, and copies logs and settings to results/ladder/. `draw`
-draws figures/ladder.png: a row a rung, a dot a seed, with its 95 % interval over the forests.
+`train` trains rung 0, Mnih's own settings, for 1.4 million steps, and all others with two seeds for
+100,000, each on one thread, two at a time, in runs/ladder-RUNG-SEED. Beside the rungs it trains the
+controls: the whole recipe with another loss or learning rate. `fly` flies two networks of each
+through 200 forests that no training, test or evaluation uses: what best.pt keeps, and the newest,
+which it writes to last.pt. It writes results/ladder.json, and copies logs and settings to
+results/ladder/. `draw` draws figures/ladder.png: a row a rung, a colour a seed, with 95 % intervals
+over the forests; a dot is best.pt, and a ring the newest network.
 """
 
 import json
@@ -26,11 +28,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from deepflight import RunConfig, dqn_pilot, summarize
-from dqn import DQNConfig, load_weights
+from dqn import DQNConfig, QNetwork, load, load_weights, save_weights
 from env import World, fly, fly_random
 
 ROOT = Path(__file__).parents[2]
 STEPS, SEEDS = 100_000, (0, 1)
+INTERVAL = ("value", "low", "high")
+PANELS = {  # figure -> title, factor
+    "over_random": ("flight time over random, %", 100),
+    "return": ("return by the paper's reward", 1),
+    "crossed": ("crossed, %", 100),
+}
 FORESTS = range(4 * 10**9, 4 * 10**9 + 200)
 
 
@@ -44,7 +52,7 @@ def back(*names: str) -> list[str]:
     return flags
 
 
-# name -> the flags that it adds to the rungs above it
+# label -> the flags that it adds to the rungs above it
 RUNGS = {
     "1 textbook DQN": ["--preset", "dqn"],
     "2 + Double": back("double"),
@@ -66,27 +74,38 @@ CONTROLS = {
 
 def trainings() -> Iterator[tuple[str, str, int, list[str]]]:
     """Of every training: its folder's name, its label, its seed and its flags."""
-    flags: list[str] = []
+    yield "ladder-0-0", "0 Mnih's settings", 0, ["--preset", "mnih"]
+    flags: list[str] = ["--steps", str(STEPS)]
     for label, more in RUNGS.items():
         flags = flags + more
         for seed in SEEDS:
             yield f"ladder-{label[0]}-{seed}", label, seed, flags
     for i, (label, more) in enumerate(CONTROLS.items()):
-        yield f"ladder-{'abcdefgh'[i]}-0", label, 0, more
+        yield f"ladder-{'abcdefgh'[i]}-0", label, 0, ["--steps", str(STEPS), *more]
 
 
 def train(training: tuple[str, str, int, list[str]]) -> None:
     """Train, or go on where an interrupted training stands, or do nothing if it is done."""
     name, label, seed, flags = training
     folder = ROOT / "runs" / name
-    words = ["--name", name, "--steps", str(STEPS), "--threads", "1", "--seed", str(seed), *flags]
+    words = ["--name", name, "--threads", "1", "--seed", str(seed), *flags]
     if (folder / "checkpoint.pt").exists():
-        if (folder / "log.csv").read_text().splitlines()[-1].startswith(f"{STEPS},"):
-            return
         words = ["--resume", str(folder)]
+        steps = json.loads((folder / "config.json").read_text())["steps"]
+        if load(folder / "checkpoint.pt", "checkpoint")["book"]["step"] >= steps:
+            return
     print(f"{name}: {label}", flush=True)
     line = [sys.executable, str(ROOT / "deepflight.py"), "train", *words]
     subprocess.run(line, cwd=ROOT, stdout=subprocess.DEVNULL, check=True)
+
+
+def networks(folder: Path) -> dict[str, QNetwork]:
+    """What best.pt keeps, and the newest network, which also goes to last.pt."""
+    saved, q = load(folder / "checkpoint.pt", "checkpoint")["agent"], QNetwork(World.actions)
+    q.load_state_dict({key: saved["q." + key] for key in q.state_dict()})
+    save_weights(folder / "last.pt", q, beacon=False)
+    files = {name: folder / f"{name}.pt" for name in ("best", "last")}
+    return {name: load_weights(path, World.actions, beacon=False) for name, path in files.items()}
 
 
 def fly_all() -> None:
@@ -96,39 +115,37 @@ def fly_all() -> None:
     draws = rng.integers(len(FORESTS), size=(2000, len(FORESTS)))  # (2000, forests)
     report: dict[str, dict[str, dict]] = {}
     for name, label, seed, _ in trainings():
-        folder = ROOT / "runs" / name
+        folder, kept = ROOT / "runs" / name, ROOT / "results/ladder" / name.removeprefix("ladder-")
         if not (folder / "best.pt").exists():
             continue
-        q = load_weights(folder / "best.pt", World.actions, beacon=False)
-        figures = summarize(fly(dqn_pilot(q), FORESTS, world), bar, draws)
+        flown = {x: fly(dqn_pilot(q), FORESTS, world) for x, q in networks(folder).items()}
+        figures = {x: summarize(flights, bar, draws) for x, flights in flown.items()}
         report.setdefault(label, {})[str(seed)] = figures
-        (kept := ROOT / "results/ladder" / name.removeprefix("ladder-")).mkdir(
-            parents=True, exist_ok=True
-        )
+        kept.mkdir(parents=True, exist_ok=True)
         for file in ("log.csv", "config.json"):
             shutil.copy(folder / file, kept / file)
-        said = {key: f"{figures[key]['value']:.2f}" for key in ("over_random", "return", "crossed")}
-        print(f"{label}, seed {seed}: {said}", flush=True)
+        for x, y in figures.items():
+            said = " ".join(f"{key} {y[key]['value']:.3f}" for key in (*PANELS, "crash", "steps"))
+            print(f"{label}, seed {seed}, {x}: {said}", flush=True)
     (ROOT / "results/ladder.json").write_text(json.dumps(report, indent=1) + "\n")
 
 
 def draw() -> None:
     """Three panels, a row a rung, its seeds one above the other."""
     report = json.loads((ROOT / "results/ladder.json").read_text())
-    panels = {"over_random": "flight time over random, %", "return": "return by the paper's reward"}
-    panels["crossed"] = "crossed, %"
-    figure, axes = plt.subplots(1, 3, figsize=(12, 4), sharey=True, layout="constrained")
-    for panel, (key, title) in zip(axes, panels.items(), strict=True):
-        factor = 1 if key == "return" else 100
-        for row, label in enumerate(RUNGS):
-            for seed, figures in report.get(label, {}).items():
-                value, low, high = (factor * figures[key][x] for x in ("value", "low", "high"))
-                y, colour = row + 0.2 * int(seed) - 0.1, f"C{seed}"
-                panel.plot([low, high], [y, y], colour, linewidth=1)
-                panel.plot(value, y, "o", color=colour)
+    rungs = sorted(label for label in report if label not in CONTROLS)
+    figure, axes = plt.subplots(1, 3, figsize=(12, 4.5), sharey=True, layout="constrained")
+    for panel, (key, (title, factor)) in zip(axes, PANELS.items(), strict=True):
+        dots = ((row, x) for row, label in enumerate(rungs) for x in report[label].items())
+        for row, (seed, figures) in dots:
+            for which, face, shift in (("best", f"C{seed}", 0.0), ("last", "white", 0.12)):
+                value, low, high = (factor * figures[which][key][x] for x in INTERVAL)
+                y = row + 0.26 * int(seed) - 0.19 + shift
+                panel.plot([low, high], [y, y], f"C{seed}", linewidth=1)
+                panel.plot(value, y, "o", color=f"C{seed}", markerfacecolor=face, markersize=5)
         panel.set_title(title, fontsize=11)
         panel.grid(alpha=0.3)
-    axes[0].set_yticks(range(len(RUNGS)), RUNGS)
+    axes[0].set_yticks(range(len(rungs)), rungs)
     axes[0].invert_yaxis()
     figure.savefig(ROOT / "figures/ladder.png", dpi=100)
     print("wrote figures/ladder.png")
