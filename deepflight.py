@@ -378,8 +378,9 @@ class Run:
         if saved:
             self.restore(saved)
         folder.mkdir(parents=True, exist_ok=True)
-        for part in (part for name in RUN_FILES for part in folder.glob(f".{name}.????????.part")):
-            part.unlink()  # of a save that was killed
+        for name in RUN_FILES:
+            for part in folder.glob(f".{name}.{'[0-9a-f]' * 8}.part"):  # of a save that was killed
+                dqn.attempt(part.unlink)
         self.save()
         with dqn.whole_file(folder / "config.json") as file:
             file.write(json.dumps(asdict(c) | asdict(rc), indent=2).encode())
@@ -447,13 +448,15 @@ class Run:
         row["test_over_random"] = row["test_steps"] / random_steps(TESTS, self.fleet.world) - 1
         row["seconds"] = round(book["seconds"], 1)
         book["log"] = [*(book["log"] or [",".join(row)]), ",".join(map(str, row.values()))]
-        with dqn.whole_file(self.folder / "log.csv") as file:
-            file.write("\n".join([*book["log"], ""]).encode())
         score = [row["test_goal" if self.rc.beacon else "test_crossed"], row["test_progress"]]
-        if late or score > book["best"]:
-            book["best"] = score
-            dqn.save_weights(self.folder / "best.pt", q, beacon=self.rc.beacon)
-        self.save()  # and then print, which may fail
+        try:
+            with dqn.whole_file(self.folder / "log.csv") as file:
+                file.write("\n".join([*book["log"], ""]).encode())
+            if late or score > book["best"]:
+                dqn.save_weights(self.folder / "best.pt", q, beacon=self.rc.beacon)
+                book["best"] = score
+        finally:
+            self.save()  # and then print, which may fail
         say(ROW.format(**row | self.clock))
 
     def content(self) -> dict[str, Any]:

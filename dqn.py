@@ -110,12 +110,12 @@ import hashlib
 import io
 import os
 import re
+import secrets
 import warnings
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import Any, BinaryIO, NamedTuple
 from zipfile import ZipFile
 
@@ -441,27 +441,24 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
     Links are followed to their target, folders made. Raises OSError where that is impossible.
     """
-    target, part = Path(os.path.realpath(path)), None
+    target = Path(os.path.realpath(path))
+    part = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
     made = [folder for folder in target.parents if not folder.exists()]
-    name = {"prefix": f".{target.name}.", "suffix": ".part"}
-    try:
+    with ExitStack() as at_last:  # whatever happens, even a signal in the midst of this
+        for take_away in (*(folder.rmdir for folder in reversed(made)), part.unlink):
+            at_last.callback(attempt, take_away)
         target.parent.mkdir(parents=True, exist_ok=True)
-        with NamedTemporaryFile(dir=target.parent, delete=False, **name) as part:
-            yield part
-            part.flush()
-            os.fsync(part.fileno())
-        os.umask(umask := os.umask(0))
-        os.chmod(part.name, 0o666 & ~umask)
-        os.replace(part.name, target)
-    except BaseException as error:
-        if isinstance(error, OSError):
-            error.filename = error.filename or str(path)  # a full disk does not name it
-        if part:
-            os.unlink(part.name)
-        for folder in made:
-            with suppress(OSError):  # it was not made
-                folder.rmdir()
-        raise
+        with part.open("xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, target)
+
+
+def attempt(take_away: Callable[[], None]) -> None:
+    """Take a file or folder away. A file that has its name by now, or a full folder, stays."""
+    with suppress(OSError):
+        take_away()
 
 
 def check_output(path: Path, mark: bytes) -> None:
@@ -474,7 +471,7 @@ def check_output(path: Path, mark: bytes) -> None:
         with suppress(EOFError), whole_file(path):
             raise EOFError  # a rehearsal: nothing of it stays
     except OSError as error:
-        raise ValueError(f"{path} cannot be written: {error.strerror}") from None
+        raise ValueError(f"{path} cannot be read or written: {error.strerror}") from None
 
 
 def head(path: Path) -> bytes:
@@ -533,7 +530,7 @@ def check_like(found: Any, like: Any, where: object) -> None:
         for key in like:
             check_like(found[key], like[key], f"{where}: {key}")
     elif isinstance(like, Tensor):
-        for trait in ("dtype", "layout", "device", "shape"):
+        for trait in ("is_nested", "dtype", "layout", "device", "shape"):
             if (a := getattr(found, trait)) != (b := getattr(like, trait)):
                 raise ValueError(f"{where} is a tensor of {trait} {a}, not {b}")
     if isinstance(like, Tensor | float) and not torch.isfinite(torch.as_tensor(found)).all():

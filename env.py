@@ -437,6 +437,7 @@ def say(text: str, end: str = "\n", file: TextIO | None = None) -> None:
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
         if file is not sys.stderr and error.errno not in (errno.EPIPE, errno.EIO):
+            error.filename = file.name
             raise
 
 

@@ -17,6 +17,7 @@ import signal
 import subprocess
 import sys
 import threading
+import warnings
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import suppress
@@ -220,11 +221,14 @@ def test_whatever_is_in_a_folder_that_is_not_ours_stays(
         assert (run / name).read_bytes() == data
     shutil.copytree(uninterrupted, run, dirs_exist_ok=True)
     (run / ".thesis.part").write_text("chapter one")
+    (run / ".log.csv.original.part").write_text("the data of years")
+    (run / ".best.pt.0123abcd.part").mkdir()
     (run / ".checkpoint.pt.a1b2c3d4.part").write_text(
         "half a checkpoint, of a save that was killed"
     )
     assert deepflight.main(["train", "--resume", str(run), "--steps", "808"]) == 0
-    assert [path.name for path in run.glob(".*")] == [".thesis.part"]
+    stay = {".best.pt.0123abcd.part", ".log.csv.original.part", ".thesis.part"}
+    assert {path.name for path in run.glob(".*")} == stay
     (run / "log.csv").unlink()
     (run / "log.csv").symlink_to(mine)
     assert deepflight.main(["train", "--resume", str(run), "--steps", "808"]) == 2
@@ -457,6 +461,10 @@ def test_a_malicious_checkpoint_runs_nothing(
 # -------------------------------------------------- what an attacker signs
 
 
+with warnings.catch_warnings(action="ignore"):  # torch's, that these are in a prototype stage
+    NESTED = torch.nested.nested_tensor([torch.zeros(2)] * 2)
+
+
 def odd_attributes() -> object:
     """A dictionary whose own `keys` hides the method: torch.load keeps such attributes."""
     odd = OrderedDict()
@@ -472,7 +480,7 @@ def odd_thing(rng: np.random.Generator) -> object:
         *(OrderedDict(), odd_attributes()),
         *(torch.zeros(size), torch.full(size, math.nan), torch.zeros(3136, 512).to_sparse()),
         *(torch.zeros(size, dtype=x) for x in (torch.int8, torch.float16, torch.complex64)),
-        torch.zeros(1).expand(512, 3136),
+        *(torch.zeros(1).expand(512, 3136), NESTED),
     ]
     return things[rng.integers(len(things))]
 
