@@ -509,7 +509,7 @@ def load(path: Path, kind: str) -> dict:
         raise ValueError(f"{path} cannot be read: {why}") from None
     if not whole:
         raise ValueError(f"{path} is damaged, or no file of Deep Flight: its digest is wrong")
-    if not isinstance(content, dict) or content.pop("kind", None) != kind:
+    if type(content) is not dict or content.pop("kind", None) != kind:
         raise ValueError(f"{path} holds something else than {kind}")
     return content
 

@@ -525,7 +525,7 @@ def checkpoints_are_refused_or_fly(
     for _ in range(trials):
         shutil.copytree(whole, folder, dirs_exist_ok=True)
         spoilt = spoil(content, rng)
-        save(folder / CHECKPOINT, "checkpoint", spoilt if isinstance(spoilt, dict) else {})
+        save(folder / CHECKPOINT, "checkpoint", spoilt if type(spoilt) is dict else {})
         before = {path: path.read_bytes() for path in folder.iterdir()}
         code = deepflight.main(["train", "--resume", str(folder), "--steps", "808"])
         error = capsys.readouterr().err
