@@ -361,8 +361,8 @@ RUN_FILES = {  # of a run's folder, and how each begins
     "log.csv": b"step,episodes,updates,epsilon,train_steps,.*,test_over_random",
     "checkpoint.pt": b"PK.*kind.*checkpoint.*settings.*steps.*gamma",
 }  # fmt: skip
-# Ctrl-C, kill, a closed terminal, Ctrl-\, a limit on the processor's time
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGXCPU)
+# Ctrl-C, kill, a closed terminal, Ctrl-\
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
 class Run:
@@ -378,9 +378,10 @@ class Run:
         if saved:
             self.restore(saved)
         folder.mkdir(parents=True, exist_ok=True)
-        for name in RUN_FILES:
-            for part in folder.glob(f".{name}.{'[0-9a-f]' * 8}.part"):  # of a save that was killed
-                dqn.attempt(part.unlink)
+        for name, mark in RUN_FILES.items():
+            for part in folder.glob(f".{name}.{'[0-9a-f]' * 8}.part"):
+                if re.match(mark + b"|$", dqn.head(part), re.DOTALL):  # of a save that was killed
+                    dqn.attempt(part.unlink)
         self.save()
         with dqn.whole_file(folder / "config.json") as file:
             file.write(json.dumps(asdict(c) | asdict(rc), indent=2).encode())
@@ -449,14 +450,12 @@ class Run:
         row["seconds"] = round(book["seconds"], 1)
         book["log"] = [*(book["log"] or [",".join(row)]), ",".join(map(str, row.values()))]
         score = [row["test_goal" if self.rc.beacon else "test_crossed"], row["test_progress"]]
-        try:
-            with dqn.whole_file(self.folder / "log.csv") as file:
-                file.write("\n".join([*book["log"], ""]).encode())
-            if late or score > book["best"]:
-                dqn.save_weights(self.folder / "best.pt", q, beacon=self.rc.beacon)
-                book["best"] = score
-        finally:
-            self.save()  # and then print, which may fail
+        with dqn.whole_file(self.folder / "log.csv") as file:
+            file.write("\n".join([*book["log"], ""]).encode())
+        if late or score > book["best"]:
+            dqn.save_weights(self.folder / "best.pt", q, beacon=self.rc.beacon)
+            book["best"] = score
+        self.save()  # and then print, which may fail
         say(ROW.format(**row | self.clock))
 
     def content(self) -> dict[str, Any]:

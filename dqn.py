@@ -470,8 +470,9 @@ def check_output(path: Path, mark: bytes) -> None:
             raise ValueError(f"{path} exists, and this program did not write it: move it away")
         with suppress(EOFError), whole_file(path):
             raise EOFError  # a rehearsal: nothing of it stays
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read or written: {error.strerror}") from None
+    except (OSError, RecursionError) as error:  # Recursion: too many folders in one another
+        why = getattr(error, "strerror", "too deep")
+        raise ValueError(f"{path} cannot be read or written: {why}") from None
 
 
 def head(path: Path) -> bytes:

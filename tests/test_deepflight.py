@@ -270,6 +270,7 @@ eval --json text.pt/x.json
 eval --json LONG
 eval --json new/LONG/new
 eval --out new/LONG/new
+eval --out DEEP
 eval --json diary
 eval --json o --out o
 eval --json o/flight.gif/r.json --out o
@@ -307,7 +308,8 @@ def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
     before = sorted(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
     for line in lines:
-        words = line.replace("HUGE", "9" * 400).replace("LONG", "x" * 300).split(" ")
+        words = line.replace("HUGE", "9" * 400).replace("LONG", "x" * 300)
+        words = words.replace("DEEP", "a/" * 1900).split(" ")
         code = deepflight.main(["" if word == "EMPTY" else word for word in words if word])
         out, error = capsys.readouterr()
         assert code == 2, line

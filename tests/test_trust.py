@@ -223,11 +223,17 @@ def test_whatever_is_in_a_folder_that_is_not_ours_stays(
     (run / ".thesis.part").write_text("chapter one")
     (run / ".log.csv.original.part").write_text("the data of years")
     (run / ".best.pt.0123abcd.part").mkdir()
-    (run / ".checkpoint.pt.a1b2c3d4.part").write_text(
-        "half a checkpoint, of a save that was killed"
-    )
+    (run / ".best.pt.deadbeef.part").write_text("notes")
+    half = (run / "checkpoint.pt").read_bytes()[:5000]
+    (run / ".checkpoint.pt.a1b2c3d4.part").write_bytes(half)  # of a save that was killed
+    (run / ".log.csv.00000000.part").touch()
     assert deepflight.main(["train", "--resume", str(run), "--steps", "808"]) == 0
-    stay = {".best.pt.0123abcd.part", ".log.csv.original.part", ".thesis.part"}
+    stay = {
+        ".best.pt.0123abcd.part",
+        ".best.pt.deadbeef.part",
+        ".log.csv.original.part",
+        ".thesis.part",
+    }
     assert {path.name for path in run.glob(".*")} == stay
     (run / "log.csv").unlink()
     (run / "log.csv").symlink_to(mine)
