@@ -163,8 +163,25 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #             move the weights of Q a little against the gradient of the loss
 #             every so many updates: Q^ = Q
 #
-# `train` is this loop, and the pieces marked [+name]. What belongs to files, tests and clocks is
-# asked of `run` (class Run, below):
+# `train` is this loop, and the pieces marked [+name]:
+#
+#     [+num_envs]       eight drones fly side by side: one pass through Q serves all of them
+#     [+adam]           another rule for the move of the weights (dqn.make_optimizer)
+#     [+lr_decay]       the learning rate falls: large strides at first, small ones to settle
+#     [+forward_reward] [+goal_value] [+far_value]    what `learner_reward` adds
+#     [+n_steps]        a label holds five true rewards (dqn.Replay.window)
+#     [+mirror]         half of each batch is reflected (dqn.mirror)
+#     [+double]         Q chooses the best action of s2, and Q^ says its worth (dqn.td_target)
+#     [+bfloat16]       quicker convolutions (dqn.QNetwork)
+#     [+huber]          an error e pulls by e / delta up to delta, and by 1 beyond. With [Mnih15]'s
+#                       delta of 1 errors of 2 and of 50 pull equally hard, which is steady. After
+#                       100,000 steps delta is 100, so that a rare crash pulls harder than a small
+#                       mistake
+#     [+max_grad_norm]  a long gradient is cut, so that one strange batch cannot ruin Q
+#     [+average]        in the last tenth of the steps the mean of Q's weights is taken, to be
+#                       flown: every update changes how Q flies, and a mean is steady
+#
+# What belongs to files, tests and clocks is asked of `run` (class Run, below):
 #
 #     run.steps()       8, 16, 24, ...: eight drones fly, so each pass makes eight control steps
 #     run.due(4)        how many multiples of 4 the eight of this pass hold: two updates are due
@@ -175,30 +192,26 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 
 
 def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | None = None) -> int:
-    """Algorithm 1 of [Mnih15]; the numbers are its lines, listed in dqn.py. [+name] is an extra.
-    folder: of the run's files. saved: a checkpoint to go on with. Returns the exit code."""
+    """Algorithm 1 of [Mnih15]. A number in a comment is one of its lines, listed in dqn.py; then
+    comes the shape. folder: of the run's files. saved: a checkpoint to go on with. Returns the exit
+    code."""
     world, rng = World(beacon=rc.beacon), np.random.default_rng(rc.seed)
     replay = Replay(c.replay_size, c.num_envs)  # 1
     agent = Agent(c, world.actions, rc.seed)  # 2, 3
-    fleet = Fleet(world, c.num_envs)  # [+num_envs] one pass through Q serves all drones
+    fleet = Fleet(world, c.num_envs)  # [+num_envs]
     run = Run(folder, c, rc, (agent, replay, fleet, rng), saved)
     for step in run.steps():
         epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
-        # [+lr_decay] The learning rate: large strides at first, small ones to settle.
-        lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)
+        lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
         agent.optimizer.param_groups[0]["lr"] = lr
-        # [+huber] The loss of an error e is e^2 / (2 delta) up to delta, |e| - delta / 2 beyond. If
-        # delta is 1, errors of 1 and 50 have slopes 1 and 1: steady. If it is 100, 0.01 and 0.5: a
-        # rare crash counts 50 times. (That all slopes are smaller, Adam makes up for.)
-        delta = c.huber if step > c.huber_after else 1.0
-
+        delta = c.huber if step > c.huber_after else 1.0  # [+huber]
         fleet.reset(fleet.landed, rng.integers(TRAIN_END, size=len(fleet.landed)))  # 4, 5
         s = fleet.observations  # 6 (L, 4, 84, 84), because all L drones are in the air
-        explore = rng.random(c.num_envs) < epsilon  # (L,) 7
+        explore = rng.random(c.num_envs) < epsilon  # 7 (L,)
         anything = rng.integers(world.actions, size=c.num_envs)  # (L,)
-        a = np.where(explore, anything, greedy(agent.q, s))  # (L,) 8
+        a = np.where(explore, anything, greedy(agent.q, s))  # 8 (L,)
         s2, r, terminated, truncated, infos = fleet.step(a)  # 9, 10
-        r = learner_reward(r, infos, rc, c.gamma)  # (L,) [+forward_reward] and the two values
+        r = learner_reward(r, infos, rc, c.gamma)  # (L,)
         end = np.where(terminated, dqn.TERMINAL, np.where(truncated, dqn.TRUNCATED, dqn.LIVE))
         replay.add(s, a, r, s2, end)  # 11
         updates = run.due(c.update_every) if step >= c.learning_starts else 0
@@ -208,20 +221,19 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
             b = dqn.Batch(*map(torch.from_numpy, batch))
             with torch.no_grad():
                 q2 = agent.q_target(b.s2, agent.bfloat16)  # (B, A) [+bfloat16]
-                # [+double] Q chooses a2, and Q^ says what it is worth.
-                q2_online = agent.q(b.s2, agent.bfloat16) if c.double else q2  # (B, A)
-                y = td_target(b.r, b.gamma_n, b.end, q2, q2_online)  # (B,) 13
+                q2_online = agent.q(b.s2, agent.bfloat16) if c.double else q2  # (B, A) [+double]
+                y = td_target(b.r, b.gamma_n, b.end, q2, q2_online)  # 13 (B,)
             q_sa = agent.q(b.s, agent.bfloat16).gather(1, b.a[:, None])[:, 0]  # (B,)
             agent.loss = torch.nn.functional.smooth_l1_loss(q_sa, y, beta=delta)  # 14
             agent.optimizer.zero_grad()
             agent.loss.backward()
-            if c.max_grad_norm:  # [+max_grad_norm] so that one strange batch cannot ruin Q
+            if c.max_grad_norm:  # [+max_grad_norm]
                 torch.nn.utils.clip_grad_norm_(agent.q.parameters(), c.max_grad_norm)
             agent.optimizer.step()
             agent.updates += 1
             if agent.updates % c.target_every == 0:
                 agent.q_target.load_state_dict(agent.q.state_dict())  # 15
-            if run.last_share:  # [+average] every update changes how Q flies; a mean is steady
+            if run.last_share:  # [+average]
                 agent.mean.update_parameters(agent.q)
 
         run.note()
