@@ -2,7 +2,7 @@
 
     python deepflight.py train                  the default recipe, in the paper's world
     python deepflight.py train --beacon         where a pole makes the goal visible
-    python deepflight.py train --preset dqn     textbook DQN, without our additions
+    python deepflight.py train --preset dqn     textbook DQN, but with Adam and eight drones
     python deepflight.py train --preset mnih    [Mnih15]'s training parameters
     python deepflight.py train --resume DIR     go on with an interrupted training
     python deepflight.py eval                   fly weights/paper.pt against three other pilots
@@ -75,7 +75,7 @@ TRAIN_END, TEST_FIRST, EVAL_FIRST = 10**9, 10**9, 2 * 10**9  # forest seeds
 TESTS = range(TEST_FIRST, TEST_FIRST + 48)  # the forests of a test point
 
 
-CORES = max(os.cpu_count() or 1, 8)  # more threads than these would stand in each other's way
+CORES = max(os.cpu_count() or 1, 8)  # the most threads that a setting may ask for
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #         every 4 steps:
 #             b = 32 random transitions of the replay
 #             y = b.r if b.end is TERMINAL else b.r + gamma * max Q^(b.s2, .)
-#             loss = the mean of (y - Q(b.s, b.a))^2, straight lines beyond an error of 1
+#             loss = the mean of (y - Q(b.s, b.a))^2 / 2, straight lines beyond an error of 1
 #             move the weights of Q a little against the gradient of the loss
 #             every so many updates: Q^ = Q
 #
@@ -173,10 +173,10 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #     [+mirror]         half of each batch is reflected (dqn.mirror)
 #     [+double]         Q chooses the best action of s2, and Q^ says its worth (dqn.td_target)
 #     [+bfloat16]       quicker convolutions (dqn.QNetwork)
-#     [+huber]          an error e pulls by e / delta up to delta, and by 1 beyond. With [Mnih15]'s
-#                       delta of 1 errors of 2 and of 50 pull equally hard, which is steady. After
-#                       100,000 steps delta is 100, so that a rare crash pulls harder than a small
-#                       mistake
+#     [+huber]          the slope of the loss is e / delta up to an error e of delta, and 1 beyond.
+#                       If delta is 1 as in [Mnih15], errors of 2 and of 50 have the same slope,
+#                       which is steady. After 100,000 steps delta is 100: a rare crash then counts
+#                       more than a small mistake. (Adam evens out that all slopes are smaller)
 #     [+max_grad_norm]  a long gradient is cut, so that one strange batch cannot ruin Q
 #     [+average]        in the last tenth of the steps the mean of Q's weights is taken, to be
 #                       flown: every update changes how Q flies, and a mean is steady
@@ -581,7 +581,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     commands = parser.add_subparsers(metavar="train or eval", required=True)
     sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
     sub.set_defaults(run=start_training, preset="default", name=None, resume=None)
-    kinds = "dqn: textbook DQN; mnih: with [Mnih15]'s parameters"
+    kinds = "dqn: textbook DQN with Adam; mnih: with [Mnih15]'s parameters"
     sub.add_argument("--preset", choices=PRESETS, metavar="NAME", help=kinds)
     sub.add_argument("--name", help="name of the folder in runs/; by default a new number")
     sub.add_argument("--resume", type=place, help="folder of a training to go on with")

@@ -22,17 +22,17 @@ with a label: the number that should have come out. Nobody has the labels. But t
 r plus gamma times the return from s2, and the drone that takes the best action in s2 may expect the
 greatest Q of s2. So every transition makes a label y for Q(s, a):
 
-    y = r + gamma * max over a2 of Q(s2, a2)        where a crash or such ends the flight: y = r
+    y = r + gamma * max over a2 of Q(s2, a2)        but y = r where a crash ends the flight
 
 In numbers: r = 0.5, and the greatest of the nine values Q(s2, .) is 10. Then y = 0.5 + 0.99 * 10 =
 10.4. If Q(s, a) is 8, its error is 2.4. A gradient step changes every weight a little, in the
 direction that makes the error smaller. Now Q(s, a) is perhaps 8.1. The label is called the TD
 target (for temporal difference), and the equation is Bellman's.
 
-How can a network learn from labels that it makes itself? Each label holds one true reward, and at
-the end of a flight the whole label is true. Take a flight of three steps with rewards 0.5, 0.5 and
--10. To keep it small, let there be one action only, so that the max is its Q. Let all Q be 0 at
-first, and let every update go all the way to its label:
+How can a network learn from labels that it makes itself? Each label holds one true reward, and
+where a crash ends a flight the whole label is true. Take a flight of three steps with rewards 0.5,
+0.5 and -10. To keep it small, let there be one action only, so that the max is its Q. Let all Q be
+0 at first, and let every update go all the way to its label:
 
                   Q of step 1   step 2   step 3   (each row from the row above it)
     after update 1    0.5         0.5     -10     the crash is known
@@ -74,8 +74,8 @@ code carries these numbers. `train` in deepflight.py has all of them on one scre
 In our words: an episode is a flight, the emulator is env.py, x is a picture, phi_t is the stack of
 four pictures that we call s, and theta are the weights.
 
-PyTorch in six lines. The loss is one number that says how wrong a batch of outputs is, such as the
-mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, and how fast.
+PyTorch in six lines. The loss is one number that says how wrong a batch of outputs is, such as half
+the mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, and how fast.
     q(s)               calls QNetwork.forward; a tensor is an array that remembers how it was made,
                        so that the chain rule can lead back to every weight
     torch.no_grad()    do not remember; so a label is a constant, and only Q(s, a) is moved
@@ -84,10 +84,11 @@ mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, 
     optimizer.step()   move its weights a little against it; the learning rate says how far
     values.gather(1, a[:, None])[:, 0]      in NumPy: values[arange(len(a)), a]
 
-A mark like [+double] means: not in the textbook. The name is the setting that switches it off. As
-textbook we also count a limit of [Mnih15] to line 14. Up to an error of 1 the loss is half its
-square. Beyond that the loss is a straight line, so that a large error pulls no harder than an error
-of 1. [Mnih15] also cuts rewards to [-1, 1]. We do not, because -10 is not -1.
+A mark like [+double] means: not in the textbook. The name is the setting that switches it off.
+[Mnih15] limits line 14, and we count that as textbook: up to an error of 1 the loss is half the
+error's square, and beyond it a straight line. So a large error changes the weights no more than an
+error of 1. [Mnih15] also cuts rewards to [-1, 1]. We do not, because a crash would then count no
+more than being near a trunk.
 
 Legend
     s, a      state and action

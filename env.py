@@ -30,9 +30,9 @@ One step in numbers: the drone is at x = 30 on the middle line, so d_goal = 60, 
 is 1.5 m away. That is too close: -5 * (2.0 - 1.5) / (2.0 - 0.75) = -2. A third of the way is made:
 1 - 60 / 90 = 0.33. The reward of the step is -1.67.
 
-This is the paper's reward. By it, leaving by the far edge costs 10 too. But the goal stands there,
-and a pilot that cannot see the goal can do no better than to cross the forest. So in training the
-network is paid more than this: see `learner_reward` in deepflight.py.
+This is the paper's reward. By it a drone that circles in one place earns as much as one that flies
+on, and leaving by the far edge costs 10, although the goal stands there. So in training the network
+is paid more than this: see `learner_reward` in deepflight.py.
 
 A flight ends in one of two ways. It is **terminated** when the world itself ends it: by a crash, by
 arrival, or by leaving the forest. No more reward can follow. It is **truncated** when only the
@@ -260,7 +260,7 @@ class ForestEnv:
 
     def scan(self) -> tuple[ndarray, ndarray]:
         """The laser's beams: bearings from the heading (360,) rad, counter-clockwise from dead
-        ahead, and distances (360,) m, 20 where nothing is hit."""
+        ahead, and distances (360,) m, 20 where nothing is hit within 20 m."""
         bearings = np.arange(self.world.beams) * (2 * math.pi / self.world.beams)  # (360,)
         offsets = self.trunks - self.pose[:2]  # (N, 2) m
         distance, _ = raycast(offsets, self.world.trunk_radius, bearings + self.pose[2])
@@ -383,8 +383,9 @@ def laser_pilot(fleet: Fleet) -> Sequence[int]:
 def dynamic_window(bearings: ndarray, distances: ndarray, goal_bearing: float, world: World) -> int:
     """Simulate 1.5 s of each yaw rate against the scan's points and take the best.
 
-    score = 10 * seconds until the clearance is below 0.8 m + 2 * least clearance (2 m at most)
-            - 4 * heading error to the goal at the arc's end in rad
+    score = 10 * (seconds until the clearance is below 0.8 m)
+            + 2 * (least clearance in m, at most 2)
+            - 4 * (heading error to the goal at the arc's end, rad)
     """
     # In the drone's axes a point is the complex number x + iy.
     points = (distances * np.exp(1j * bearings))[distances < world.laser_range]  # (P,) m

@@ -116,11 +116,12 @@ def raycast(
     # at trunk 8, the ray's place is 1 * 84 + 28 = 112.
     meet = np.flatnonzero(np.abs(across) < radius)  # (H,) the pairs that meet
     half_chord = np.sqrt(radius**2 - across.ravel()[meet] ** 2)  # (H,) m
-    distance = along.ravel()[meet] - half_chord  # (H,) m, negative: the trunk is behind the eye
+    distance = along.ravel()[meet] - half_chord  # (H,) m; the trunk is behind if below 0
     trunk, ray = meet // rays, meet % rays  # (H,), (H,)
     place = ray if eye is None else eye[trunk] * rays + ray  # (H,)
     first, facing = np.full(eyes * rays, np.inf), np.zeros(eyes * rays)  # (E * M,), (E * M,)
-    np.minimum.at(first, place, np.where(distance > 0, distance, np.inf))  # .at: places may repeat
+    # A ray may hit several trunks. np.minimum.at then keeps the least of all its distances.
+    np.minimum.at(first, place, np.where(distance > 0, distance, np.inf))
     nearest = distance == first[place]  # (H,) the hits that are their ray's first
     facing[place[nearest]] = half_chord[nearest] / radius
     return first, facing
@@ -183,7 +184,8 @@ def camera(
     if beacon is not None:
         to_pole = pole_distance((np.subtract(beacon, at)[:, None] @ turn)[:, 0], scene)  # (E * 84,)
         pole = silhouette(to_pole, scene.beacon_height, scene)  # (84, E * 84)
-        frames[pole & ~(trunk & (distance < to_pole))] = scene.beacon_grey
+        hidden = trunk & (distance < to_pole)  # (84, E * 84) by a nearer trunk
+        frames[pole & ~hidden] = scene.beacon_grey
     return np.ascontiguousarray(frames.reshape(PIXELS, eyes, PIXELS).swapaxes(0, 1))
 
 

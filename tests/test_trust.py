@@ -17,6 +17,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -565,13 +566,18 @@ def test_signed_checkpoints_of_whatever_content_are_refused_or_fly(
 def test_interrupted_at_ten_random_moments_is_uninterrupted(
     uninterrupted: Path, tmp_path: Path
 ) -> None:
+    process = start("train", *FLAGS, "--name", "whole", folder=tmp_path)
+    flies(process)
+    began = time.perf_counter()
+    process.communicate()
+    whole = time.perf_counter() - began  # s, on a machine as busy as this one
     rng, steps, names = np.random.default_rng(), [], (f"cut{i}" for i in count())
     while len(steps) < 10 or sum(step > SMALL["replay_size"] for step in steps) < 2:
         name = next(names)
         process = start("train", *FLAGS, "--name", name, folder=tmp_path)
         flies(process)
         try:
-            process.wait(rng.uniform(0, 3))
+            process.wait(rng.uniform(0, whole))
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGINT)
         process.communicate()
