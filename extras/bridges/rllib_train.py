@@ -90,6 +90,14 @@ def make_config(c: DQNConfig, r: RunConfig, runners: int) -> RayConfig:
     epsilon = [[0, 1.0], [c.epsilon_decay, c.epsilon_final]]
     # RLlib counts one runner too many when it works out how often to learn.
     intensity = c.batch_size / c.update_every * runners / (runners + 1)
+    learning = dict(
+        lr=[[0, c.lr], [c.steps, c.lr * c.lr_decay]], gamma=c.gamma, n_step=c.n_steps,
+        double_q=c.double, dueling=False, num_atoms=1, epsilon=epsilon,
+        train_batch_size_per_learner=c.batch_size, training_intensity=intensity,
+        num_steps_sampled_before_learning_starts=c.learning_starts, td_error_loss_fn="huber",
+        target_network_update_freq=c.target_every * c.update_every, adam_epsilon=ADAM_EPSILON,
+        grad_clip=c.max_grad_norm, grad_clip_by="global_norm", replay_buffer_config=replay,
+    )  # fmt: skip
     return (
         RayConfig()
         .environment(ID)
@@ -100,24 +108,7 @@ def make_config(c: DQNConfig, r: RunConfig, runners: int) -> RayConfig:
         # A lost runner starts again where a CPU is free; until then the others fly on.
         .fault_tolerance(restart_failed_env_runners=True, env_runner_health_probe_timeout_s=PROBE)
         .rl_module(rl_module_spec=RLModuleSpec(module_class=Nature))
-        .training(
-            lr=[[0, c.lr], [c.steps, c.lr * c.lr_decay]],
-            gamma=c.gamma,
-            n_step=c.n_steps,
-            double_q=c.double,
-            dueling=False,
-            num_atoms=1,
-            epsilon=epsilon,
-            train_batch_size_per_learner=c.batch_size,
-            training_intensity=intensity,
-            num_steps_sampled_before_learning_starts=c.learning_starts,
-            target_network_update_freq=c.target_every * c.update_every,
-            td_error_loss_fn="huber",
-            adam_epsilon=ADAM_EPSILON,
-            grad_clip=c.max_grad_norm,
-            grad_clip_by="global_norm",
-            replay_buffer_config=replay,
-        )
+        .training(**learning)
         .debugging(seed=r.seed)
     )
 
@@ -181,14 +172,9 @@ def start(address: str | None, runners: int) -> None:
     if address:
         knock(address)
     code = {"working_dir": str(ROOT), "excludes": [".venv", "runs", "results", "figures"]}
-    ray.init(
-        address=address or "local",
-        num_cpus=None if address else runners,
-        runtime_env=code,
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level=logging.ERROR,
-    )
+    quiet = {"include_dashboard": False, "log_to_driver": False, "logging_level": logging.ERROR}
+    cpus = None if address else runners  # a Ray that runs knows its own
+    ray.init(address=address or "local", num_cpus=cpus, runtime_env=code, **quiet)
     if runners > (free := int(ray.available_resources().get("CPU", 0))):
         raise ValueError(f"runners is {runners}, allowed here: 1 to {free}, one a free CPU")
 
