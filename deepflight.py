@@ -726,7 +726,4 @@ if __name__ == "__main__":
     for number in STOPS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, stop_at_once)
-    code = main()
-    for number in STOPS:
-        signal.signal(number, signal.SIG_IGN)  # the end has begun already
-    sys.exit(code)
+    os._exit(main())  # at once, because a signal could hit Python's own slow end
