@@ -162,15 +162,10 @@ def camera(
     beacon: where the goal's pole stands, or None where there is none; it shows from any distance.
     The E pictures are drawn side by side, as one picture of E * 84 columns, and cut at the end.
     """
-    eyes, at, heading = len(poses), poses[:, :2], poses[:, 2]
-    cos, sin = np.cos(heading), np.sin(heading)  # (E,), (E,)
-    # One matrix per drone, into its own axes: (x, y) @ turn = (x cos + y sin, y cos - x sin), which
-    # is (ahead, left).
-    turn = np.array([[cos, -sin], [sin, cos]]).transpose(2, 0, 1)  # (E, 2, 2) x, y -> ahead, left
-    body = [(forest - xy) @ to for forest, xy, to in zip(trunks, at, turn, strict=True)]
+    eyes = len(poses)
     eye = np.repeat(np.arange(eyes), [len(forest) for forest in trunks])  # (N,) who looks at it
-    body = np.concatenate(body)  # (N, 2) m, every trunk in the axes of the drone that looks at it
-    ahead, left = body.T  # (N,), (N,) m
+    body = np.concatenate([seen_from(*pair) for pair in zip(poses, trunks, strict=True)])  # (N, 2)
+    ahead, left = body.T  # (N,), (N,) m, of every trunk, for the drone that looks at it
     # Keep what may be in the picture: ahead, in view, and between its two edges at 45 degrees, with
     # two radii to spare because a trunk is wide.
     near = (ahead > 0) & (ahead < scene.view) & (np.abs(left) < ahead + 2 * scene.trunk_radius)
@@ -182,11 +177,25 @@ def camera(
     grey = fade(bark, distance, scene).astype(np.uint8)  # (E * 84,)
     frames = trunk * grey + ~trunk * backdrop(scene)  # (84, E * 84) uint8: bark, or what is behind
     if beacon is not None:
-        to_pole = pole_distance((np.subtract(beacon, at)[:, None] @ turn)[:, 0], scene)  # (E * 84,)
+        goal = np.concatenate([seen_from(pose, np.array([beacon])) for pose in poses])  # (E, 2) m
+        to_pole = pole_distance(goal, scene)  # (E * 84,) m
         pole = silhouette(to_pole, scene.beacon_height, scene)  # (84, E * 84)
         hidden = trunk & (distance < to_pole)  # (84, E * 84) by a nearer trunk
         frames[pole & ~hidden] = scene.beacon_grey
     return np.ascontiguousarray(frames.reshape(PIXELS, eyes, PIXELS).swapaxes(0, 1))
+
+
+def seen_from(pose: ndarray, points: ndarray) -> ndarray:
+    """How far ahead and to the left of a drone these points lie: (N, 2) m.
+
+    pose (3,): x, y in m and heading in rad. points (N, 2): x, y in m.
+
+    >>> seen_from(np.array([1.0, 0.0, 0.0]), np.array([[4.0, 2.0]]))
+    array([[3., 2.]])
+    """
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    # (x, y) @ this = (x cos + y sin, y cos - x sin), which is (ahead, left)
+    return (points - pose[:2]) @ np.array([[cos, -sin], [sin, cos]])  # (N, 2)
 
 
 def pole_distance(goal: ndarray, scene: Scene) -> ndarray:
