@@ -143,7 +143,7 @@ def setting(value: Any, text: str, low: float, high: float = 1e9) -> Any:
 class DQNConfig:
     """The algorithm's settings. [+] is not in the textbook; its text says what switches it off."""
 
-    steps: int = setting(300_000, "control steps in all", 1)
+    steps: int = setting(200_000, "control steps in all", 1)
     gamma: float = setting(0.99, "discount per step [DF II-A]", 0, 1)
     replay_size: int = setting(200_000, "transitions remembered, 7.1 kB each", 1, 1e7)
     learning_starts: int = setting(5_000, "control steps before the first update", 1)
@@ -158,10 +158,8 @@ class DQNConfig:
     double: bool = setting(True, "[+] Double DQN [van Hasselt 2016]; --no-double: off", 0, 1)
     n_steps: int = setting(5, "[+] true rewards in a label; 1: off", 1, 100)
     mirror: bool = setting(True, "[+] reflect half of every batch; --no-mirror: off", 0, 1)
-    huber: float = setting(100.0, "[+] delta: larger errors pull no harder; 1: Mnih's", 1e-3, 1e6)
-    huber_after: int = setting(100_000, "[+] control steps with Mnih's 1, then huber", 0)
+    huber: float = setting(10.0, "[+] delta: larger errors pull no harder; 1: Mnih's", 1e-3, 1e6)
     lr_decay: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
-    max_grad_norm: float = setting(10.0, "[+] longer gradients are cut to this; 0: off", 0, 1e6)
     average: float = setting(0.1, "[+] last share of the steps, averaged to fly; 0: off", 0, 0.5)
     bfloat16: bool = setting(True, "[+] quick convolutions if the CPU has it; --no-bfloat16", 0, 1)
 
@@ -284,14 +282,17 @@ class Replay:
         self.rows, self.lanes = shape
         self.added = 0  # rows ever written
 
-    def add(self, s: ndarray, a: ndarray, r: ndarray, s2: ndarray, end: ndarray) -> None:
-        """Write one transition per lane (line 11): s, s2 (L, 4, 84, 84), a, r, end (L,)."""
+    def add(
+        self, s: ndarray, a: ndarray, r: ndarray, s2: ndarray,
+        terminated: ndarray, truncated: ndarray,
+    ) -> None:  # fmt: skip
+        """Write one transition per lane (line 11): s, s2 (L, 4, 84, 84), all others (L,)."""
         row = self.added % self.rows
-        self.frames[row], self.actions[row] = s[:, -1], a
-        self.rewards[row], self.ends[row] = r, end
+        self.frames[row], self.actions[row], self.rewards[row] = s[:, -1], a, r
+        self.ends[row] = np.where(terminated, TERMINAL, np.where(truncated, TRUNCATED, LIVE))
         for lane in range(self.lanes):
             self.last_frames.pop((row, lane), None)
-            if end[lane] == TRUNCATED:
+            if self.ends[row, lane] == TRUNCATED:
                 self.last_frames[row, lane] = s2[lane, -1].copy()
         self.added += 1
 
@@ -403,8 +404,8 @@ class RMSprop(torch.optim.Optimizer):
         for w, means in self.state.items():
             mean, mean_square = means.values()
             mean.lerp_(w.grad, 0.05)
-            mean_square.lerp_(w.grad**2, 0.05)
-            deviation = (mean_square - mean**2 + 0.01 / 32**2).sqrt()
+            mean_square.lerp_(w.grad.square(), 0.05)
+            deviation = (mean_square - mean.square()).add_(0.01 / 32**2).sqrt_()
             w.addcdiv_(w.grad, deviation, value=-self.param_groups[0]["lr"])
 
 
@@ -416,8 +417,9 @@ def make_optimizer(theta: Iterable[Tensor], c: DQNConfig) -> torch.optim.Optimiz
     if not c.adam:
         return RMSprop(theta, c.lr)
     adam = torch.optim.Adam(theta, c.lr, eps=1.5e-4, fused=True)
-    # An update by a gradient of 0 moves no weight, and makes Adam's running means. So every
-    # checkpoint holds the same tensors. Its count of updates goes back to 0.
+    # Adam makes its running means at its first step. Make them here, by a step with a gradient of
+    # 0, which moves no weight. So every checkpoint holds the same tensors. Then set Adam's count of
+    # steps back to 0.
     for w in theta:
         w.grad = torch.zeros_like(w)
     adam.step()

@@ -15,7 +15,10 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from torch.optim.optimizer import register_optimizer_step_post_hook
+from torch.optim.optimizer import (
+    register_optimizer_step_post_hook,
+    register_optimizer_step_pre_hook,
+)
 
 import deepflight
 from deepflight import RunConfig, train
@@ -81,7 +84,7 @@ def fill(logs: list[list[tuple]], capacity: int) -> Replay:
         s = np.stack([np.stack([picture(f)] * 4) for f, *_ in row])  # only the newest frame counts
         s2 = np.stack([np.stack([picture(30_000 + f)] * 4) for f, *_ in row])
         a, r, end = (np.array(column) for column in list(zip(*row, strict=True))[1:])
-        replay.add(s, a, r, s2, end)
+        replay.add(s, a, r, s2, end == TERMINAL, end == TRUNCATED)
     return replay
 
 
@@ -512,15 +515,34 @@ def test_where_the_copy_falls_on_the_last_update_both_networks_are_equal(tmp_pat
     )  # no mean: Q flies
 
 
+def test_one_crash_in_ten_flights_moves_q_by_its_share_if_delta_is_as_large() -> None:
+    y = torch.tensor([-10.0] + 9 * [0.0])  # one label is a crash
+    q = torch.tensor([-1 / 9, -1.0], requires_grad=True)
+    for value, delta in zip(q, (1.0, 10.0), strict=True):
+        # 9 * q + 1 = 0 with Mnih's delta of 1; the mean of the labels with ours
+        torch.nn.functional.smooth_l1_loss(value.expand(10), y, beta=delta).backward()
+    assert q.grad.tolist() == pytest.approx([0, 0], abs=1e-7)  # where the loss is least
+
+
 @pytest.mark.usefixtures("corridor")
-def test_errors_are_clipped_at_1_until_the_step_that_lifts_it(tmp_path: Path) -> None:
-    c = replace(WALK, steps=120, learning_starts=60, batch_size=4)
-    narrow, wide = (
-        [weights for _, weights in strides(replace(c, huber=h, huber_after=80), tmp_path / str(h))]
-        for h in (1.0, 100.0)
-    )
-    equal = [torch.equal(x, y) for x, y in zip(narrow, wide, strict=True)]
-    assert equal == [step <= 80 for step in range(60, 121, 4)]
+def test_a_training_clips_errors_at_huber(tmp_path: Path) -> None:
+    def first_gradient(delta: float) -> torch.Tensor:
+        seen = []
+        hook = register_optimizer_step_pre_hook(
+            lambda optimizer, *_: seen.append(optimizer.param_groups[0]["params"][-1].grad.clone())
+        )
+        c = replace(WALK, steps=60, learning_starts=59, batch_size=4, huber=delta)
+        try:
+            assert train(c, PLAIN, tmp_path / str(delta)) == 0
+        finally:
+            hook.remove()
+        return seen[1]  # the first is Agent's own, by a gradient of 0
+
+    wide = first_gradient(1000.0)  # no error is as large, so the slope is e / delta
+    assert wide.any()
+    assert torch.allclose(10 * wide, first_gradient(100.0), rtol=1e-3, atol=0)
+    lines = 4 * first_gradient(1e-3)  # every error is larger: 4 slopes of 1, a mean over 4
+    assert torch.allclose(lines, lines.round(), atol=1e-6)
 
 
 # -------------------------------------------------- files that are whole, or not there

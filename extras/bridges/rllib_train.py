@@ -96,7 +96,7 @@ def make_config(c: DQNConfig, r: RunConfig, runners: int) -> RayConfig:
         train_batch_size_per_learner=c.batch_size, training_intensity=intensity,
         num_steps_sampled_before_learning_starts=c.learning_starts, td_error_loss_fn="huber",
         target_network_update_freq=c.target_every * c.update_every, adam_epsilon=ADAM_EPSILON,
-        grad_clip=c.max_grad_norm, grad_clip_by="global_norm", replay_buffer_config=replay,
+        replay_buffer_config=replay,
     )  # fmt: skip
     return (
         RayConfig()

@@ -15,6 +15,7 @@ of the test range without random actions, and prints the same of them as `eval/`
 it writes are the last ones. Ctrl-C writes those so far.
 """
 
+import math
 import shlex
 import sys
 from collections.abc import Sequence
@@ -62,7 +63,7 @@ def make_model(c: DQNConfig, r: RunConfig, replay: int = REPLAY) -> DQN:
         exploration_fraction=c.epsilon_decay / c.steps,
         exploration_initial_eps=1.0,
         exploration_final_eps=c.epsilon_final,
-        max_grad_norm=c.max_grad_norm,
+        max_grad_norm=math.inf,  # ours cuts no gradient
         policy_kwargs={"optimizer_kwargs": {"eps": ADAM_EPSILON}},
         seed=r.seed,
         device="cpu",
