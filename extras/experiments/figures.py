@@ -3,7 +3,8 @@
     extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.experiments.figures
 
-figures/learning.png: every results/*/log.csv is a training, and each is a curve.
+figures/learning.png: every log in results/ of the recipe is a training, and so is rung 0 of the
+ladder; each is a curve, against control steps and against flights.
 figures/crossed.png: what crosses in the paper's world, beside the laser pilot with and without a
 compass. figures/flight.gif: a flight of results/eval.json, flown again, with the values that
 weights/paper.pt gives to each turn.
@@ -32,8 +33,12 @@ PANELS = {  # column of log.csv -> title
     "test_return": "Figure 3: total reward on the test forests",
     "test_steps": "Figure 4: flight time on the test forests, steps",
 }
-# folder -> label, and the colour that the recipe has in every picture
-LABELS = {"paper": ("the paper's world", "C0"), "beacon": ("with the beacon", "C1")}
+CURVES = {  # label -> folders in results/, and the colour in every picture
+    "the paper's world, three seeds": (("paper", "paper-1", "paper-2"), "C0"),
+    "with the beacon": (("beacon",), "C1"),
+    "Mnih's settings": (("ladder/0-0",), "C2"),
+}
+AXES = {"step": "control steps", "episodes": "flights"}  # column of log.csv -> label
 Log = dict[str, np.ndarray]  # the columns of a log.csv (T,)
 
 
@@ -65,29 +70,31 @@ def finish(figure: Figure, name: str) -> None:
 
 
 def draw_learning() -> None:
-    """Three panels, one picture."""
-    paths = sorted(ROOT.glob("results/*/log.csv"), reverse=True)  # the paper's world first
-    logs = {path.parent.name: read(path) for path in paths}
-    figure, panels = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
-    for axes, (column, title) in zip(panels, PANELS.items(), strict=True):
-        for name, log in logs.items():
-            label, colour = LABELS[name]
-            axes.plot(log["step"], log[column], colour, label=label, linewidth=1.2)
-        levels(axes, column, next(iter(logs.values())))
-        axes.set_title(title, fontsize=11)
-        axes.set(xlabel="control steps", xscale="log")
-    handles, labels = panels[-1].get_legend_handles_labels()
-    figure.legend(handles, labels, fontsize=9, ncols=len(labels), loc="outside lower center")
+    """Three panels against control steps, and three against flights."""
+    figure, panels = plt.subplots(2, 3, figsize=(13, 7), sharey="col", layout="constrained")
+    for row, (x, text) in zip(panels, AXES.items(), strict=True):
+        for axes, (column, title) in zip(row, PANELS.items(), strict=True):
+            for label, (names, colour) in CURVES.items():
+                for log in (read(ROOT / f"results/{name}/log.csv") for name in names):
+                    axes.plot(log[x], log[column], colour, label=label, linewidth=1)
+            levels(axes, column, log)
+            axes.set(xlabel=text, xscale="log")
+            if x == "step":
+                axes.set_title(title, fontsize=11)
+    handles, labels = axes.get_legend_handles_labels()
+    legend = dict(zip(labels, handles, strict=True))  # each label once
+    figure.legend(legend.values(), legend, fontsize=9, ncols=5, loc="outside lower center")
     finish(figure, "learning.png")
 
 
 def draw_crossed() -> None:
     """The share of test flights that cross, a mean over five test points."""
     figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
-    log = read(ROOT / "results/paper/log.csv")
-    share = np.convolve(100 * log["test_crossed"], np.ones(5) / 5, "valid")  # (T - 4,) %
-    colour = LABELS["paper"][1]
-    axes.plot(log["step"][4:], share, colour, label="the camera pilot in training", linewidth=1.2)
+    names, _ = next(iter(CURVES.values()))
+    for seed, name in enumerate(names):
+        log, label = read(ROOT / f"results/{name}/log.csv"), f"the camera pilot, seed {seed}"
+        share = np.convolve(100 * log["test_crossed"], np.ones(5) / 5, "valid")  # (T - 4,) %
+        axes.plot(log["step"][4:], share, f"C{seed}", label=label, linewidth=1.2)
     laser = json.loads((ROOT / "results/compass.json").read_text())
     for way, line in (("straight on", ":"), ("by compass", "--")):
         y = laser[f"the laser pilot, {way}: crossed, %"]

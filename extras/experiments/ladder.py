@@ -4,13 +4,15 @@
     extras/.venv/bin/python -m extras.experiments.ladder fly     # minutes; what is trained so far
     extras/.venv/bin/python -m extras.experiments.ladder draw
 
-`train` trains rung 0, Mnih's own settings, for 1.4 million steps, and all others with two seeds for
-100,000, each on one thread, two at a time, in runs/ladder-RUNG-SEED. Beside the rungs it trains the
-controls: the whole recipe with another loss or learning rate. `fly` flies two networks of each
-through 200 forests that no training, test or evaluation uses: what best.pt keeps, and the newest,
-which it writes to last.pt. It writes results/ladder.json, and copies logs and settings to
-results/ladder/. `draw` draws figures/ladder.png: a row a rung, a colour a seed, with 95 % intervals
-over the forests; a dot is best.pt, and a ring the newest network.
+`train` trains rung 0, Mnih's own settings, for 1.4 million steps, rungs 1 to 7 with two seeds for
+100,000, and rung 8, the default recipe, with three. Each has one thread, and two run at a time, in
+runs/ladder-RUNG-SEED; those of the recipe in runs/paper, runs/paper-1 and runs/paper-2. Beside the
+rungs it trains the controls: rung 7 with another loss or learning rate. What has been flown is not
+trained again. `fly` flies two networks of each through 200 forests that no training, test or
+evaluation uses: what best.pt keeps, and the newest, which it writes to last.pt. It adds them to
+results/ladder.json, and copies logs and settings to results/. `draw` draws figures/ladder.png: a
+row a rung, a colour a seed, with 95 % intervals over the forests; a dot is best.pt, and a ring the
+newest network.
 """
 
 import json
@@ -58,18 +60,27 @@ RUNGS = {
     "2 + Double": back("double"),
     "3 + five-step returns": back("n_steps"),
     "4 + mirror images": back("mirror"),
-    "5 + loss and learning rate": back("huber", "lr_decay", "max_grad_norm"),
+    "5 + loss and learning rate": back("huber", "lr_decay"),
     "6 + mean of the weights": back("average"),
     "7 + pay for crossing": back("forward_reward", "goal_value", "far_value"),
 }
 CONTROLS = {
     "huber 1": ["--huber", "1"],
-    "huber 1, no clipping": ["--huber", "1", "--max-grad-norm", "0"],
     "huber 1, a quarter of lr": ["--huber", "1", "--lr", "6e-5"],
-    "huber 10 throughout": ["--huber", "10", "--huber-after", "0"],
-    "huber 100 throughout": ["--huber", "100", "--huber-after", "0"],
-    "huber 100, twice the lr": ["--huber", "100", "--huber-after", "0", "--lr", "5e-4"],
+    "huber 100": ["--huber", "100"],
+    "huber 100, twice the lr": ["--huber", "100", "--lr", "5e-4"],
 }
+
+
+def kept(name: str) -> Path:
+    """The folder of a training's settings and log in results/."""
+    return ROOT / "results" / name.replace("ladder-", "ladder/")
+
+
+def flown() -> dict[str, dict[str, dict]]:
+    """What has been flown: label -> seed -> network -> figure."""
+    path = ROOT / "results/ladder.json"
+    return json.loads(path.read_text()) if path.exists() else {}
 
 
 def trainings() -> Iterator[tuple[str, str, int, list[str]]]:
@@ -80,6 +91,8 @@ def trainings() -> Iterator[tuple[str, str, int, list[str]]]:
         flags = flags + more
         for seed in SEEDS:
             yield f"ladder-{label[0]}-{seed}", label, seed, flags
+    for seed in (*SEEDS, 2):
+        yield f"paper-{seed}".removesuffix("-0"), "8 the recipe", seed, []
     for i, (label, more) in enumerate(CONTROLS.items()):
         yield f"ladder-{'abcdefgh'[i]}-0", label, 0, ["--steps", str(STEPS), *more]
 
@@ -88,15 +101,24 @@ def train(training: tuple[str, str, int, list[str]]) -> None:
     """Train, or go on where an interrupted training stands, or do nothing if it is done."""
     name, label, seed, flags = training
     folder = ROOT / "runs" / name
+    if str(seed) in flown().get(label, {}):
+        return
     words = ["--name", name, "--threads", "1", "--seed", str(seed), *flags]
+    if finished(folder):
+        return
     if (folder / "checkpoint.pt").exists():
         words = ["--resume", str(folder)]
-        steps = json.loads((folder / "config.json").read_text())["steps"]
-        if load(folder / "checkpoint.pt", "checkpoint")["book"]["step"] >= steps:
-            return
     print(f"{name}: {label}", flush=True)
     line = [sys.executable, str(ROOT / "deepflight.py"), "train", *words]
     subprocess.run(line, cwd=ROOT, stdout=subprocess.DEVNULL, check=True)
+
+
+def finished(folder: Path) -> bool:
+    """Whether this training has come to its end."""
+    if not (folder / "checkpoint.pt").exists():
+        return False
+    steps = json.loads((folder / "config.json").read_text())["steps"]
+    return load(folder / "checkpoint.pt", "checkpoint")["book"]["step"] >= steps
 
 
 def networks(folder: Path) -> dict[str, QNetwork]:
@@ -109,21 +131,21 @@ def networks(folder: Path) -> dict[str, QNetwork]:
 
 
 def fly_all() -> None:
-    """Fly whatever is trained, write the figures, keep logs and settings."""
+    """Fly what is trained and not yet flown, write the figures, keep logs and settings."""
     world, rng = World(), np.random.default_rng(0)
     bar = fly_random(FORESTS, world, rng)
     draws = rng.integers(len(FORESTS), size=(2000, len(FORESTS)))  # (2000, forests)
-    report: dict[str, dict[str, dict]] = {}
+    report = flown()
     for name, label, seed, _ in trainings():
-        folder, kept = ROOT / "runs" / name, ROOT / "results/ladder" / name.removeprefix("ladder-")
-        if not (folder / "best.pt").exists():
+        folder = ROOT / "runs" / name
+        if str(seed) in report.get(label, {}) or not finished(folder):
             continue
-        flown = {x: fly(dqn_pilot(q), FORESTS, world) for x, q in networks(folder).items()}
-        figures = {x: summarize(flights, bar, draws) for x, flights in flown.items()}
+        flights = {x: fly(dqn_pilot(q), FORESTS, world) for x, q in networks(folder).items()}
+        figures = {x: summarize(f, bar, draws) for x, f in flights.items()}
         report.setdefault(label, {})[str(seed)] = figures
-        kept.mkdir(parents=True, exist_ok=True)
+        kept(name).mkdir(parents=True, exist_ok=True)
         for file in ("log.csv", "config.json"):
-            shutil.copy(folder / file, kept / file)
+            shutil.copy(folder / file, kept(name) / file)
         for x, y in figures.items():
             said = " ".join(f"{key} {y[key]['value']:.3f}" for key in (*PANELS, "crash", "steps"))
             print(f"{label}, seed {seed}, {x}: {said}", flush=True)
@@ -132,7 +154,7 @@ def fly_all() -> None:
 
 def draw() -> None:
     """Three panels, a row a rung, its seeds one above the other."""
-    report = json.loads((ROOT / "results/ladder.json").read_text())
+    report = flown()
     rungs = sorted(label for label in report if label not in CONTROLS)
     figure, axes = plt.subplots(1, 3, figsize=(12, 4.5), sharey=True, layout="constrained")
     for panel, (key, (title, factor)) in zip(axes, PANELS.items(), strict=True):
