@@ -94,14 +94,15 @@ SETTINGS = (*fields(DQNConfig), *fields(RunConfig))
 # flying ahead is not the aim: a pilot that is paid for it passes the goal. Finding the goal takes
 # longer to learn.
 BEACON = {"steps": 400_000, "forward_reward": 0.0, "far_value": 50.0}
-# Textbook DQN on the paper's reward, with Adam. Eight drones fly side by side.
+# Textbook DQN on the paper's reward, with Adam. What is only quicker stays: eight drones fly side
+# by side, in bfloat16.
 DQN = dict(
     double=False, n_steps=1, mirror=False, huber=1.0, lr_decay=1.0, average=0.0,
     forward_reward=0.0, goal_value=0.0, far_value=0.0,
 )  # fmt: skip
 # [Mnih15, Extended Data Table 1], as the paper says [DF §II-B]. 1.4 M steps are the paper's own.
-# Mnih's table counts the target network's 10,000 in updates. Mnih's code counts steps. We follow
-# the code: 10,000 steps are 2,500 updates.
+# How old may the target network be? 10,000, says Mnih's table, and means updates. Mnih's code
+# counts 10,000 steps, which are 2,500 updates. We follow the code.
 MNIH = DQN | dict(
     steps=1_400_000, replay_size=1_000_000, learning_starts=50_000, target_every=2_500,
     epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, bfloat16=False,
@@ -125,10 +126,10 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 
     Why forward_reward: r depends on where the drone is, and not on where it goes. A drone that
     circles in one place earns there as much as one that flies through it.
-    Why goal_value: arrival ends the flight, and with it all rewards. A drone that circled at the
-    goal for ever would earn 1.25 + 0.99 * 1.25 + 0.99^2 * 1.25 + ... = 1.25 / (1 - 0.99) = 125.
-    If arrival paid less, circling would be better. So the last reward gets gamma * 125 more, as if
-    the drone lived on after its arrival.
+    Why goal_value: arrival ends the flight, and with it all rewards. A drone that could stay near
+    the goal for ever would earn at most 1.25 + 0.99 * 1.25 + ... = 1.25 / (1 - 0.99) = 125 there.
+    If arrival paid less, staying near could be better. So the last reward gets gamma * 125 more, as
+    if the drone lived on after its arrival.
     Why far_value: no picture shows which edge is the far one. Leaving by any other edge costs 10,
     and so does this one in the paper's reward. It must pay so much that the risk is worth it; 200
     was found by trial. It is more than 125, so this pilot crosses often and seldom arrives.
@@ -172,9 +173,11 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #     [+mirror]         half of each batch is reflected (dqn.mirror)
 #     [+double]         Q chooses the best action of s2, and Q^ says its worth (dqn.td_target)
 #     [+bfloat16]       quicker convolutions (dqn.QNetwork)
-#     [+huber]          the loss has straight lines beyond an error of 10, not of 1. An error of 10
-#                       then pulls ten times as hard as one of 1. With 1, a crash in every tenth
-#                       flight would hardly move Q: straight lines find a median, not a mean
+#     [+huber]          the loss has straight lines beyond an error of 10, not of 1. Say that nine
+#                       labels of ten are 0, and one is -10, a crash: Q should be their mean, -1. If
+#                       no error pulls harder than 1, Q comes to rest where 9 * (0 - Q) = 1, at
+#                       -0.11, and the crash is nearly ignored. If it may pull by 10, Q becomes -1.
+#                       (PyTorch also divides the loss by this number)
 #     [+average]        in the last tenth of the steps the mean of Q's weights is taken, to be
 #                       flown: every update changes how Q flies, and a mean is steady
 #
@@ -183,11 +186,12 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #     run = Run(...)    makes the files; or, given a checkpoint, sets agent, replay, fleet and rng
 #                       to what they were there
 #     run.steps()       8, 16, 24, ...: eight drones fly, so each pass makes eight control steps
-#     run.due(4)        how many multiples of 4 the eight of this pass hold: two updates are due
+#     run.due(4)        how often something that is due every 4 steps is due in this pass: of the
+#                       steps 9 to 16 two are multiples of 4, so two updates are due
 #     run.last_share    whether this is the last tenth of all steps
 #     run.note()        counts flights, shows progress
-#     run.test()        flies the test forests, saves, keeps the best weights in best.pt;
-#                       in the last tenth the mean of the weights flies, and is kept
+#     run.test()        flies the test forests, saves, keeps the weights of the best test in
+#                       best.pt; in the last tenth the mean of the weights flies, and is kept
 
 
 def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | None = None) -> int:

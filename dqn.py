@@ -22,7 +22,8 @@ with a label: the number that should have come out. Nobody has the labels. But t
 r plus gamma times the return from s2, and the drone that takes the best action in s2 may expect the
 greatest Q of s2. So every transition makes a label y for Q(s, a):
 
-    y = r + gamma * max over a2 of Q(s2, a2)        but y = r where a crash ends the flight
+    y = r + gamma * max over a2 of Q(s2, a2)
+    y = r    if the world ended the flight: a crash, arrival, leaving the forest
 
 In numbers: r = 0.5, and the greatest of the nine values Q(s2, .) is 10. Then y = 0.5 + 0.99 * 10 =
 10.4. If Q(s, a) is 8, its error is 2.4. A gradient step changes every weight a little, in the
@@ -84,11 +85,12 @@ the mean of (y - Q)^2. Its gradient says for every weight which way the loss gro
     optimizer.step()   move its weights a little against it; the learning rate says how far
     values.gather(1, a[:, None])[:, 0]      in NumPy: values[arange(len(a)), a]
 
-A mark like [+double] means: not in the textbook. The name is the setting that switches it off.
+A mark like [+double] means: not in the textbook. The name is its setting, whose help says which
+value switches it off. One update in four steps is Mnih's too, although Algorithm 1 has one a step.
 [Mnih15] limits line 14, and we count that as textbook: up to an error of 1 the loss is half the
 error's square, and beyond it a straight line. So a large error changes the weights no more than an
-error of 1. [Mnih15] also cuts rewards to [-1, 1]. We do not, because a crash would then count no
-more than being near a trunk.
+error of 1. (Our limit is 10 [+huber].) [Mnih15] also cuts rewards to [-1, 1]. We do not, because a
+crash would then count no more than being near a trunk.
 
 Legend
     s, a      state and action
@@ -172,9 +174,9 @@ class QNetwork(nn.Module):
 
     pictures (4, 84, 84) -> conv 32 8x8/4 -> conv 64 4x4/2 -> conv 64 3x3/1 -> 512 -> Q(s, .) (A,)
 
-    conv 32 8x8/4: 32 small filters of 8x8 pixels slide over the picture in strides of 4 pixels, and
-    each answers strongly where it finds its pattern. ReLU makes negative numbers 0. The last layer
-    has none, because values may be negative.
+    conv 32 8x8/4: 32 small filters of 8x8 pixels, through all four pictures, slide over them in
+    strides of 4 pixels. Each answers strongly where it finds its pattern. ReLU makes negative
+    numbers 0. The last layer has none, because values may be negative.
     """
 
     def __init__(self, actions: int) -> None:
@@ -326,7 +328,7 @@ class Replay:
             r = r + live * power * self.rewards[last, lane]  # (B,)
         end = self.ends[last, lane]  # (B,)
         s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), lane)  # (B, 4, 84, 84)
-        for i in np.flatnonzero(end == TRUNCATED):  # no row holds s2: append its last picture
+        for i in np.flatnonzero(end == TRUNCATED):  # no row holds s2: it is s and one more picture
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], lane[i]]]
         a = self.actions[row, lane].astype(np.int64)  # (B,)
         return Batch(self.stack(row, lane), a, r, s2, power * np.float32(gamma), end)
@@ -353,7 +355,7 @@ class Agent(nn.Module):
             self.q = QNetwork(actions).to(memory_format=layout)  # line 2
             self.q_target = QNetwork(actions).to(memory_format=layout)
         self.q_target.load_state_dict(self.q.state_dict())  # line 3
-        self.mean = AveragedModel(self.q)  # [+average]
+        self.mean = AveragedModel(self.q)  # [+average] the mean of Q's weights over its updates
         self.optimizer = make_optimizer(self.q.parameters(), c)
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -389,8 +391,9 @@ class RMSprop(torch.optim.Optimizer):
 
     The variance is the running mean of g^2, less the square of the running mean of g. Both of
     Mnih's 0.95 are decay factors of these means. PyTorch's own RMSprop with momentum 0.95 is
-    another algorithm: it has a velocity. Mnih's epsilon is 0.01 for a gradient that is the sum over
-    a batch of 32. Ours is the mean, so our epsilon is 0.01 / 32^2.
+    another algorithm: there, each move goes on with 0.95 of the last one. Mnih's epsilon is 0.01
+    for a gradient that is the sum over a batch of 32. Ours is the mean, so our epsilon is 0.01 /
+    32^2.
     """
 
     def __init__(self, theta: Any, lr: float) -> None:

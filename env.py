@@ -30,14 +30,14 @@ One step in numbers: the drone is at x = 30 on the middle line, so d_goal = 60, 
 is 1.5 m away. That is too close: -5 * (2.0 - 1.5) / (2.0 - 0.75) = -2. A third of the way is made:
 1 - 60 / 90 = 0.33. The reward of the step is -1.67.
 
-This is the paper's reward. By it a drone that circles in one place earns as much as one that flies
-on, and leaving by the far edge costs 10, although the goal stands there. So in training the network
-is paid more than this: see `learner_reward` in deepflight.py.
+This is the paper's reward. By it a drone that circles in one place earns as much a step as one that
+passes through, and leaving by the far edge costs 10, although the goal stands there. So in training
+the network is paid more than this: see `learner_reward` in deepflight.py.
 
 A flight ends in one of two ways. It is **terminated** when the world itself ends it: by a crash, by
 arrival, or by leaving the forest. No more reward can follow. It is **truncated** when only the
 clock ends it, after 1,000 steps: the drone was still flying, and more reward would have followed.
-Whoever learns from the flight must not confuse the two.
+Whoever learns from the flight must not confuse the two, or it learns that late states are bad.
 
 Each step is: turn, fly 0.5 m, sense (d_obs, d_goal), judge (is it over?), reward, look. pymunk, a
 physics library, moves the drone and measures d_obs. render.py draws what the drone sees. A flight
@@ -199,7 +199,7 @@ class ForestEnv:
         self.outcome = "not reset"  # a reset that fails leaves no flight in the air
         self.trunks, self.seed = plant(seed, self.world), int(seed)  # (N, 2)
         for circle, centre in zip(self.bark, self.trunks.tolist(), strict=True):
-            circle.unsafe_set_offset(centre)  # moves a trunk, ten times as fast as a new one
+            circle.unsafe_set_offset(centre)  # quicker than a new circle, ten times
         self.space.reindex_static()  # tells pymunk that they moved
         self.drone.position, self.drone.angle, self.pose = (0.0, 0.0), 0.0, (0.0, 0.0, 0.0)
         self.actions, self.progress, self.total = [], 0.0, 0.0

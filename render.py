@@ -27,8 +27,8 @@ ground plane. A camera is 84 rays. A laser scanner is 360 rays. One formula serv
       distance   = along - half_chord             from the eye to the bark
       facing     = half_chord / radius            the cosine of the angle at #: 1 head-on, 0 grazing
 
-    One ray in numbers: a trunk of radius 0.5 m stands 10 m ahead and 0.3 m to the right. The
-    ray that points straight ahead has along = 10 and across = -0.3, so half_chord = 0.4, and the
+    One ray in numbers: a trunk of radius 0.5 m stands 10 m ahead and 0.3 m to the right. A ray
+    that points straight ahead has along = 10 and across = -0.3, so half_chord = 0.4, and the
     bark is 10 - 0.4 = 9.6 m away. The trunk's top is 4 m above the eye, and its foot 2 m below. It
     fills its column from row 41.5 - 42 * 4 / 9.6 = 24.0 down to row 41.5 + 42 * 2 / 9.6 = 50.25.
 
@@ -48,7 +48,7 @@ Legend
     E  eyes that look at the same time, one for each drone
     H  hits: pairs of a ray and a trunk that meet
     x, y       metres; in the drone's own axes x is ahead and y is left
-    bearing    rad, counter-clockwise from the x axis of whoever looks
+    bearing    rad, counter-clockwise from the x axis in which the trunks are given
     grey       0 is black, 255 is white
     [DF]       the Deep Flight paper, [Mnih15] the Nature paper on DQN
 
@@ -70,7 +70,7 @@ Point = tuple[float, float]  # x, y in m
 PIXELS = 84  # height and width of a picture [DF §II-A]
 CENTRE = (PIXELS - 1) / 2  # px: the optical axis meets the picture between its two middle pixels
 FOCAL = PIXELS / 2  # px: half the picture spans 45 degrees (the paper is silent: ours)
-SLOPES = (CENTRE - np.arange(PIXELS)) / FOCAL  # (84,) tangents of the columns, and of the rows
+SLOPES = (CENTRE - np.arange(PIXELS)) / FOCAL  # (84,) how far left column i looks, and up row i
 BEARINGS = np.arctan(SLOPES)  # (84,) rad
 COSINES = np.cos(BEARINGS)  # (84,) depth along the optical axis for each metre along a ray
 ROWS = np.arange(PIXELS, dtype=np.uint8)[:, None]  # (84, 1)
@@ -90,8 +90,8 @@ class Scene:
     sky: int = 90
     ground: int = 60
     trunk_facing: int = 35  # bark seen head-on
-    trunk_grazing: int = 0  # bark seen edge-on
-    beacon_grey: int = 140  # brighter than all else; pilots turned away from a white pole
+    trunk_grazing: int = 0  # bark seen edge-on, darker, so that a trunk looks round
+    beacon_grey: int = 140  # brighter than all else
 
 
 def raycast(
@@ -182,7 +182,8 @@ def camera(
         pole = silhouette(to_pole, scene.beacon_height, scene)  # (84, E * 84)
         hidden = trunk & (distance < to_pole)  # (84, E * 84) by a nearer trunk
         frames[pole & ~hidden] = scene.beacon_grey
-    return np.ascontiguousarray(frames.reshape(PIXELS, eyes, PIXELS).swapaxes(0, 1))
+    frames = frames.reshape(PIXELS, eyes, PIXELS)  # (84, E, 84) row, eye, column
+    return np.ascontiguousarray(frames.swapaxes(0, 1))  # (E, 84, 84)
 
 
 def seen_from(pose: ndarray, points: ndarray) -> ndarray:
