@@ -318,20 +318,22 @@ class Replay:
         taken in s_1. If that was not the best one, the label is too low. We accept that, because it
         learns sooner. A window stops at the end of a flight.
         """
-        # last: the row of the newest reward in r. power: gamma^k for the reward k steps on. In the
-        # example, row 1, n = 3: pass 1 gives last 2, power 0.99, r = 1 - 9.9; pass 2 adds nothing.
-        last, r, power = row, self.rewards[row, lane], np.ones(len(row), np.float32)  # (B,) each
-        for _ in range(n - 1):
-            live = self.ends[last, lane] == LIVE  # (B,) the flight goes on: take one more step
-            last = np.where(live, (last + 1) % self.rows, last)  # (B,)
-            power = np.where(live, power * np.float32(gamma), power)  # (B,)
-            r = r + live * power * self.rewards[last, lane]  # (B,)
+        # In the example, row 1, n = 3: k = 0 gives r = 1. k = 1 adds 0.99 * -10, and there the
+        # flight ends. So k = 2 adds nothing, and gamma_n stays 0.99^2.
+        r, gamma_n = np.zeros(len(row), np.float32), np.ones(len(row), np.float32)  # (B,), (B,)
+        last, live = row, np.ones(len(row), bool)  # (B,), (B,) the newest row in r; is it LIVE?
+        for k in range(n):
+            now = (row + k) % self.rows  # (B,)
+            r = r + live * gamma_n * self.rewards[now, lane]  # (B,)
+            gamma_n = np.where(live, gamma_n * np.float32(gamma), gamma_n)  # (B,)
+            last = np.where(live, now, last)  # (B,)
+            live = live & (self.ends[now, lane] == LIVE)  # (B,)
         end = self.ends[last, lane]  # (B,)
         s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), lane)  # (B, 4, 84, 84)
         for i in np.flatnonzero(end == TRUNCATED):  # no row holds s2: it is s and one more picture
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], lane[i]]]
         a = self.actions[row, lane].astype(np.int64)  # (B,)
-        return Batch(self.stack(row, lane), a, r, s2, power * np.float32(gamma), end)
+        return Batch(self.stack(row, lane), a, r, s2, gamma_n, end)
 
     def stack(self, row: ndarray, lane: ndarray) -> ndarray:
         """The states (B, 4, 84, 84) at row (B,), lane (B,); a flight's first picture repeats."""
