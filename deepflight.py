@@ -101,8 +101,8 @@ DQN = dict(
     forward_reward=0.0, goal_value=0.0, far_value=0.0,
 )  # fmt: skip
 # [Mnih15, Extended Data Table 1], as the paper says [DF §II-B]. 1.4 M steps are the paper's own.
-# How old may the target network be? 10,000, says Mnih's table, and means updates. Mnih's code
-# counts 10,000 steps, which are 2,500 updates. We follow the code.
+# Mnih's table says: copy Q to the target network every 10,000 updates. Mnih's code does it every
+# 10,000 steps, which are 2,500 updates. We follow the code.
 MNIH = DQN | dict(
     steps=1_400_000, replay_size=1_000_000, learning_starts=50_000, target_every=2_500,
     epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, bfloat16=False,
@@ -135,9 +135,10 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
     was found by trial. It is more than 125, so this pilot crosses often and seldom arrives.
 
     The field calls this reward shaping. A policy is a rule that picks the action in every state.
-    There is a kind that leaves the best policy as it is, because its payments cancel along a flight
-    (potential-based shaping [Ng 1999]). Ours is not of that kind, and is meant to change the
-    policy. Only the network sees it. Every reward that is printed or logged is the paper's.
+    One kind of it leaves the best policy as it is: what it pays for a step forward, it takes for
+    the step back (potential-based shaping [Ng 1999]). Our prizes are not of that kind, and are
+    meant to change the policy. Only the network sees it. Every reward that is printed or logged is
+    the paper's.
     """
     forward = np.array([info["forward"] for info in infos])  # (L,) m
     arrived = np.array([info["outcome"] == "goal" for info in infos])  # (L,)

@@ -75,7 +75,7 @@ code carries these numbers. `train` in deepflight.py has all of them on one scre
 In our words: an episode is a flight, the emulator is env.py, x is a picture, phi_t is the stack of
 four pictures that we call s, and theta are the weights.
 
-PyTorch in six lines. The loss is one number that says how wrong a batch of outputs is, such as half
+PyTorch in short. The loss is one number that says how wrong a batch of outputs is, such as half
 the mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, and how fast.
     q(s)               calls QNetwork.forward; a tensor is an array that remembers how it was made,
                        so that the chain rule can lead back to every weight
@@ -84,6 +84,10 @@ the mean of (y - Q)^2. Its gradient says for every weight which way the loss gro
     loss.backward()    compute the gradient, and leave it with the weights
     optimizer.step()   move its weights a little against it; the learning rate says how far
     values.gather(1, a[:, None])[:, 0]      in NumPy: values[arange(len(a)), a]
+    nn.Module          a function that owns weights; state_dict() gives them all, by name
+    nn.Sequential(f, g)     g(f(x))
+    nn.Conv2d(4, 32, 8, 4)  filters: 4 pictures in, 32 out, 8x8 pixels, strides of 4
+    x.sqrt_()          a name with _ at its end changes x itself
 
 A mark like [+double] means: not in the textbook. The name is its setting, whose help says which
 value switches it off. One update in four steps is Mnih's too, although Algorithm 1 has one a step.
