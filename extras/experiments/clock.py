@@ -26,7 +26,7 @@ from dqn import load_weights
 from env import World, fly, fly_random, measure
 
 ROOT = Path(__file__).parents[2]
-SEEDS, PAPER, POINTS = range(5), 1.8, 4
+SEEDS, PAPER, POINTS = range(5), 1.8, 3
 FORESTS = range(5 * 10**9, 5 * 10**9 + 200)
 
 
