@@ -143,8 +143,14 @@ def test_the_atlas_says_what_the_pages_say() -> None:
 def test_the_clock_on_the_pages_is_the_measured_one() -> None:
     clock = report("clock")
     steps = max(seed["step"] for seed in clock["seeds"].values())
-    assert f"After {steps:,} steps, or {clock['median']:.0f} seconds, its test flights" in FLAT
-    assert f"after {clock['median']:.0f} s and {steps:,} steps" in LONG
+    assert f"After {steps:,} steps, or {clock['median']:.0f} seconds on two, it flies over" in FLAT
+    assert f"after {clock['median']:.0f} s and at most {steps:,} steps" in LONG
+
+
+def test_the_minutes_of_a_training_are_those_of_its_log() -> None:
+    last = (ROOT / "results/paper/log.csv").read_text().splitlines()[-1].split(",")
+    minutes = float(last[-1]) / 60
+    assert f"flies {int(last[0]):,} steps, in {minutes:.0f} minutes on one thread" in FLAT
 
 
 def test_the_flights_at_three_control_rates_are_what_was_measured() -> None:
@@ -158,6 +164,16 @@ def test_the_flights_at_three_control_rates_are_what_was_measured() -> None:
     assert "is {:+.0%} at 10 Hz, {:+.0%} at 30 Hz and {:+.0%} at 50 Hz".format(*over) in (
         LONG.replace(" %", "%")
     )
+
+
+def test_each_training_of_the_ladder_is_on_the_long_page() -> None:
+    def cell(seed: dict) -> str:
+        x = {key: figure["value"] for key, figure in seed["best"].items()}
+        return f"{100 * x['over_random']:.0f} / {x['return']:.0f} / {100 * x['crossed']:.0f}"
+
+    for label, seeds in report("ladder").items():
+        cells = [cell(seeds[seed]) if seed in seeds else "" for seed in "012"]
+        assert " ".join(f"| {label} | {' | '.join(cells)} |".split()) in LONG
 
 
 def test_each_ratio_of_the_benchmark_is_on_the_long_page() -> None:
