@@ -176,6 +176,15 @@ def test_each_training_of_the_ladder_is_on_the_long_page() -> None:
         assert " ".join(f"| {label} | {' | '.join(cells)} |".split()) in LONG
 
 
+def test_what_mnihs_settings_give_is_what_was_measured() -> None:
+    for name in ("best", "last"):
+        flown = report(f"ladder/0-0/{name}")
+        assert (flown["forests"], flown["first_seed"]) == (500, 3 * 10**9)
+        x = flown["pilots"]["dqn"]
+        for key, factor, digits in (("over_random", 100, 0), ("return", 1, 1), ("crossed", 100, 1)):
+            assert shown(x[key], factor, digits) in LONG
+
+
 def test_each_ratio_of_the_benchmark_is_on_the_long_page() -> None:
     for name, figure in report("bench")["figures"].items():
         assert f"| {name} | {figure:.2f} |" in RESULTS

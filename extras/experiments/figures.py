@@ -33,10 +33,10 @@ PANELS = {  # column of log.csv -> title
     "test_return": "Figure 3: total reward on the test forests",
     "test_steps": "Figure 4: flight time on the test forests, steps",
 }
-CURVES = {  # label -> folders in results/, and the colour in every picture
-    "the paper's world, three seeds": (("paper", "paper-1", "paper-2"), "C0"),
-    "with the beacon": (("beacon",), "C1"),
-    "Mnih's settings": (("ladder/0-0",), "C2"),
+CURVES = {  # label -> folders in results/, one a seed, and the colour in the picture
+    "the paper's world": ("paper*", "C0"),
+    "with the beacon": ("beacon", "C1"),
+    "Mnih's settings": ("ladder/0-0", "C2"),
 }
 AXES = {"step": "control steps", "episodes": "flights"}  # column of log.csv -> label
 Log = dict[str, np.ndarray]  # the columns of a log.csv (T,)
@@ -47,6 +47,11 @@ def read(path: Path) -> Log:
     with path.open() as file:
         rows = list(csv.DictReader(file))
     return {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
+
+
+def logs(folders: str) -> list[Log]:
+    """The logs of these folders of results/, seed 0 first."""
+    return [read(path) for path in sorted(ROOT.glob(f"results/{folders}/log.csv"))]
 
 
 def levels(axes: plt.Axes, column: str, log: Log) -> None:
@@ -74,8 +79,8 @@ def draw_learning() -> None:
     figure, panels = plt.subplots(2, 3, figsize=(13, 7), sharey="col", layout="constrained")
     for row, (x, text) in zip(panels, AXES.items(), strict=True):
         for axes, (column, title) in zip(row, PANELS.items(), strict=True):
-            for label, (names, colour) in CURVES.items():
-                for log in (read(ROOT / f"results/{name}/log.csv") for name in names):
+            for label, (folders, colour) in CURVES.items():
+                for log in logs(folders):
                     axes.plot(log[x], log[column], colour, label=label, linewidth=1)
             levels(axes, column, log)
             axes.set(xlabel=text, xscale="log")
@@ -90,9 +95,8 @@ def draw_learning() -> None:
 def draw_crossed() -> None:
     """The share of test flights that cross, a mean over five test points."""
     figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
-    names, _ = next(iter(CURVES.values()))
-    for seed, name in enumerate(names):
-        log, label = read(ROOT / f"results/{name}/log.csv"), f"the camera pilot, seed {seed}"
+    for seed, log in enumerate(logs("paper*")):
+        label = f"the camera pilot, seed {seed}"
         share = np.convolve(100 * log["test_crossed"], np.ones(5) / 5, "valid")  # (T - 4,) %
         axes.plot(log["step"][4:], share, f"C{seed}", label=label, linewidth=1.2)
     laser = json.loads((ROOT / "results/compass.json").read_text())
