@@ -325,7 +325,7 @@ class Replay:
         # In the example, row 1, n = 3: k = 0 gives r = 1. k = 1 adds 0.99 * -10, and there the
         # flight ends. So k = 2 adds nothing, and gamma_n stays 0.99^2.
         r, gamma_n = np.zeros(len(row), np.float32), np.ones(len(row), np.float32)  # (B,), (B,)
-        last, live = row, np.ones(len(row), bool)  # (B,), (B,) the newest row in r; is it LIVE?
+        last, live = row, np.ones(len(row), bool)  # (B,), (B,) newest row in r; is more to come?
         for k in range(n):
             now = (row + k) % self.rows  # (B,)
             r = r + live * gamma_n * self.rewards[now, lane]  # (B,)
