@@ -27,8 +27,11 @@ greatest Q of s2. So every transition makes a label y for Q(s, a):
 
 In numbers: r = 0.5, and the greatest of the nine values Q(s2, .) is 10. Then y = 0.5 + 0.99 * 10 =
 10.4. If Q(s, a) is 8, its error is 2.4. A gradient step changes every weight a little, in the
-direction that makes the error smaller. Now Q(s, a) is perhaps 8.1. The label is called the TD
-target (for temporal difference), and the equation is Bellman's.
+direction that makes the error smaller. With one weight w and one input x = 4, Q is w * x, and w = 2
+makes it 8. Half the error's square is 2.88. If w grew by a little d, Q would grow by 4 * d, and
+2.88 would fall by 2.4 * 4 * d = 9.6 * d: the gradient is -9.6. The step is the learning rate, say
+0.01, times 9.6. Now w is 2.096, and Q is 8.38. The label is called the TD target (for temporal
+difference), and the equation is Bellman's.
 
 How can a network learn from labels that it makes itself? Each label holds one true reward, and
 where a crash ends a flight the whole label is true. Take a flight of three steps with rewards 0.5,
@@ -82,15 +85,15 @@ the mean of (y - Q)^2. Its gradient says for every weight which way the loss gro
     torch.no_grad()    do not remember; so a label is a constant, and only Q(s, a) is moved
     optimizer.zero_grad()   forget the last gradient
     loss.backward()    compute the gradient, and leave it with the weights
-    optimizer.step()   move its weights a little against it; the learning rate says how far
+    optimizer.step()   move the weights a little against the gradient
     values.gather(1, a[:, None])[:, 0]      in NumPy: values[arange(len(a)), a]
     nn.Module          a function that owns weights; state_dict() gives them all, by name
     nn.Sequential(f, g)     g(f(x))
     nn.Conv2d(4, 32, 8, 4)  filters: 4 pictures in, 32 out, 8x8 pixels, strides of 4
     x.sqrt_()          a name with _ at its end changes x itself
 
-A mark like [+double] means: not in the textbook. The name is its setting, whose help says which
-value switches it off. One update in four steps is Mnih's too, although Algorithm 1 has one a step.
+A mark like [+double] means: not in the textbook. `double` is then a setting, and its text says how
+to switch it off. One update in four steps is Mnih's too, although Algorithm 1 has one a step.
 [Mnih15] limits line 14, and we count that as textbook: up to an error of 1 the loss is half the
 error's square, and beyond it a straight line. So a large error changes the weights no more than an
 error of 1. (Our limit is 10 [+huber].) [Mnih15] also cuts rewards to [-1, 1]. We do not, because a
@@ -305,8 +308,8 @@ class Replay:
     def sample(self, size: int, n: int, gamma: float, rng: Generator) -> Batch:
         """Draw transitions uniformly (line 12).
 
-        Not the oldest three rows: the pictures that their stacks need may be overwritten. Not the
-        newest n rows: they need rows that are not written yet.
+        Not the oldest three rows: the rows before them, which their stacks look at, are overwritten
+        or were never written. Not the newest n rows: they need rows that are not written yet.
         """
         oldest = max(self.added - self.rows, 0) + 3
         row = rng.integers(oldest, self.added - n, size) % self.rows  # (B,)
@@ -333,8 +336,10 @@ class Replay:
             last = np.where(live, now, last)  # (B,)
             live = live & (self.ends[now, lane] == LIVE)  # (B,)
         end = self.ends[last, lane]  # (B,)
-        s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), lane)  # (B, 4, 84, 84)
-        for i in np.flatnonzero(end == TRUNCATED):  # no row holds s2: it is s and one more picture
+        # s2 is the state of the row after the last one, if the flight goes on there.
+        after = np.where(end == LIVE, (last + 1) % self.rows, last)  # (B,)
+        s2 = self.stack(after, lane)  # (B, 4, 84, 84)
+        for i in np.flatnonzero(end == TRUNCATED):  # the last row's state, and one more picture
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], lane[i]]]
         a = self.actions[row, lane].astype(np.int64)  # (B,)
         return Batch(self.stack(row, lane), a, r, s2, gamma_n, end)
@@ -395,8 +400,9 @@ def mirror(batch: Batch, actions: int, rng: Generator) -> Batch:
 class RMSprop(torch.optim.Optimizer):
     """[Mnih15]'s optimizer. A weight's gradient g moves it by -lr * g / sqrt(variance + epsilon).
 
-    The variance is the running mean of g^2, less the square of the running mean of g. Both of
-    Mnih's 0.95 are decay factors of these means. PyTorch's own RMSprop with momentum 0.95 is
+    The variance is the running mean of g^2, less the square of the running mean of g. Mnih's table
+    has a "gradient momentum" of 0.95 and a "squared gradient momentum" of 0.95. Both are decay
+    factors of these means. PyTorch's own RMSprop with momentum 0.95 is
     another algorithm: there, each move goes on with 0.95 of the last one. Mnih's epsilon is 0.01
     for a gradient that is the sum over a batch of 32. Ours is the mean, so our epsilon is 0.01 /
     32^2.
@@ -439,7 +445,8 @@ def make_optimizer(theta: Iterable[Tensor], c: DQNConfig) -> torch.optim.Optimiz
 
 # Where the processor has no bfloat16 of its own, float32 is quicker.
 HAS_BFLOAT16 = bool(torch.cpu.get_capabilities().get("avx512_bf16"))
-MACHINE = {"torch": str(torch.__version__), "bfloat16": HAS_BFLOAT16}  # another gives other bytes
+# A training goes on only where these are the same, because its numbers would differ elsewhere.
+MACHINE = {"torch": str(torch.__version__), "bfloat16": HAS_BFLOAT16}
 
 
 # -------------------------------------------------- files: skip this on a first reading

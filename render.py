@@ -101,7 +101,7 @@ def raycast(
 
     trunks (N, 2): centres relative to the eye that looks, m. radius: m. bearings (M,): rad, the
     same for every eye. Where several eyes look, each has its own forest, and `trunks` holds all of
-    them: eye (N,) is the number of each trunk's eye.
+    them: eye (N,) says which eye looks at each trunk.
     Returns the rays of the first eye, then those of the next: distance (E * M,), m along the ray,
     inf where it hits nothing, and facing (E * M,), 0 where it hits nothing.
 
@@ -203,8 +203,9 @@ def pole_distance(goal: ndarray, scene: Scene) -> ndarray:
     """How far away every column's ray meets the goal's pole: (E * 84,) m, inf where it does not.
 
     goal (E, 2): how far ahead and to the left of each eye the pole stands, m. raycast knows one
-    radius only. But a pole that is twice as thick and twice as far away looks the same. So: scale =
-    pole's radius / trunk's radius; cast at the distance / scale; multiply back.
+    radius only. But a pole twice as thick as a trunk, and twice as far away, looks as wide. So the
+    pole is brought nearer by scale = pole's radius / trunk's radius, cast like a trunk, and its
+    distance is multiplied by scale.
     """
     least = scene.beacon_pixels / 2 / FOCAL * goal[:, 0]  # (E,) m, the least radius to draw
     scale = np.maximum(scene.beacon_radius, least) / scene.trunk_radius  # (E,)
