@@ -23,7 +23,7 @@ actions. It earned 6.5 per flight, stayed in the air 401 % longer than the rando
 the forest in 31 % of the flights, and crashed in 4 %.
 
 A seed is a forest. Training plants forests from [0, 10^9). Test points fly forests from [10^9,
-2 * 10^9), and may choose the weights to keep. `eval` starts at 2 * 10^9, so its forests neither
+2 * 10^9), and choose which weights best.pt keeps. `eval` starts at 2 * 10^9, so its forests neither
 shaped the weights nor chose them. A run's folder holds config.json, log.csv, best.pt and
 checkpoint.pt.
 
@@ -82,7 +82,7 @@ class RunConfig:
 
     seed: int = dqn.setting(0, "of everything random", 0, 1e18)
     beacon: bool = dqn.setting(False, "put a visible pole at the goal", 0, 1)
-    threads: int = dqn.setting(2, "of the CPU; other numbers give other last digits", 1, CORES)
+    threads: int = dqn.setting(2, "of the CPU; another number rounds sums otherwise", 1, CORES)
     test_every: int = dqn.setting(5_000, "control steps between test points, which also save", 1)
     forward_reward: float = dqn.setting(2.0, "[+] paid per metre flown forward; 0: off", 0, 1e3)
     goal_value: float = dqn.setting(125.0, "[+] worth of arrival at the goal; 0: off", -1e6, 1e6)
@@ -90,24 +90,6 @@ class RunConfig:
 
 
 SETTINGS = (*fields(DQNConfig), *fields(RunConfig))
-# With the beacon the goal can be seen. So no other way out should be worth as much, and
-# flying ahead is not the aim: a pilot that is paid for it passes the goal. Finding the goal takes
-# longer to learn.
-BEACON = {"steps": 400_000, "forward_reward": 0.0, "far_value": 50.0}
-# Textbook DQN on the paper's reward, with Adam. What is only quicker stays: eight drones fly side
-# by side, in bfloat16.
-DQN = dict(
-    double=False, n_steps=1, mirror=False, huber=1.0, lr_decay=1.0, average=0.0,
-    forward_reward=0.0, goal_value=0.0, far_value=0.0,
-)  # fmt: skip
-# [Mnih15, Extended Data Table 1], as the paper says [DF §II-B]. 1.4 M steps are the paper's own.
-# Mnih's table says: copy Q to the target network every 10,000 updates. Mnih's code does it every
-# 10,000 steps, which are 2,500 updates. We follow the code.
-MNIH = DQN | dict(
-    steps=1_400_000, replay_size=1_000_000, learning_starts=50_000, target_every=2_500,
-    epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, bfloat16=False,
-)  # fmt: skip
-PRESETS = {"default": {}, "dqn": DQN, "mnih": MNIH}
 
 
 # -------------------------------------------------- what the network is paid
@@ -136,9 +118,9 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 
     The field calls this reward shaping. A policy is a rule that picks the action in every state.
     One kind of it leaves the best policy as it is: what it pays for a step forward, it takes for
-    the step back (potential-based shaping [Ng 1999]). Our prizes are not of that kind, and are
-    meant to change the policy. Only the network sees it. Every reward that is printed or logged is
-    the paper's.
+    the step back (potential-based shaping [Ng 1999]). The pay for metres is nearly of that kind.
+    The prizes are not, and are meant to change the policy. All this is for the network alone. Every
+    reward that is printed or logged is the paper's.
     """
     forward = np.array([info["forward"] for info in infos])  # (L,) m
     arrived = np.array([info["outcome"] == "goal" for info in infos])  # (L,)
@@ -168,7 +150,8 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #
 #     [+num_envs]       eight drones fly side by side: one pass through Q serves all of them
 #     [+adam]           another rule for the move of the weights (dqn.make_optimizer)
-#     [+lr_decay]       the learning rate falls: large strides at first, small ones to settle
+#     [+lr_decay]       the learning rate falls: large strides at first, small ones to settle. (If
+#                       more --steps are given, it rises again, to fall until the new end)
 #     [+forward_reward] [+goal_value] [+far_value]    what `learner_reward` adds
 #     [+n_steps]        a label holds five true rewards (dqn.Replay.window)
 #     [+mirror]         half of each batch is reflected (dqn.mirror)
@@ -204,19 +187,20 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
     agent = Agent(c, world.actions, rc.seed)  # 2, 3
     fleet = Fleet(world, c.num_envs)  # [+num_envs]
     run = Run(folder, c, rc, (agent, replay, fleet, rng), saved)
-    for step in run.steps():
+    for step in run.steps():  # 6
         epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
         agent.optimizer.param_groups[0]["lr"] = lr
         fleet.reset(fleet.landed, rng.integers(TRAIN_END, size=len(fleet.landed)))  # 4, 5
-        s = fleet.observations  # 6 (L, 4, 84, 84), because all L drones are in the air
+        s = fleet.observations  # (L, 4, 84, 84), because all L drones are in the air
         explore = rng.random(c.num_envs) < epsilon  # 7 (L,)
         anything = rng.integers(world.actions, size=c.num_envs)  # (L,)
         a = np.where(explore, anything, greedy(agent.q, s))  # 8 (L,)
         s2, r, terminated, truncated, infos = fleet.step(a)  # 9, 10
         r = learner_reward(r, infos, rc, c.gamma)  # (L,)
         replay.add(s, a, r, s2, terminated, truncated)  # 11
-        for _ in range(run.due(c.update_every) if step >= c.learning_starts else 0):
+        updates = run.due(c.update_every) if step >= c.learning_starts else 0
+        for _ in range(updates):
             batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
             batch = mirror(batch, world.actions, rng) if c.mirror else batch  # [+mirror]
             b = dqn.Batch(*map(torch.from_numpy, batch))
@@ -240,6 +224,29 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
     return run.finish()
 
 
+# -------------------------------------------------- other settings
+
+# With the beacon the goal can be seen. So no other way out should be worth as much. Metres are not
+# paid either: a pilot that is paid for them flies past the goal. Finding the goal takes longer to
+# learn.
+BEACON = {"steps": 400_000, "forward_reward": 0.0, "far_value": 50.0}
+# Textbook DQN on the paper's reward, with Adam. What is only quicker stays: eight drones fly side
+# by side, in bfloat16.
+DQN = dict(
+    double=False, n_steps=1, mirror=False, huber=1.0, lr_decay=1.0, average=0.0,
+    forward_reward=0.0, goal_value=0.0, far_value=0.0,
+)  # fmt: skip
+# [Mnih15, Extended Data Table 1], as the paper says [DF §II-B], but eight drones fly, and rewards
+# are not cut. 1.4 M steps are the paper's own.
+# Mnih's table says: copy Q to the target network every 10,000 updates. Mnih's code does it every
+# 10,000 steps, which are 2,500 updates. We follow the code.
+MNIH = DQN | dict(
+    steps=1_400_000, replay_size=1_000_000, learning_starts=50_000, target_every=2_500,
+    epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, bfloat16=False,
+)  # fmt: skip
+PRESETS = {"default": {}, "dqn": DQN, "mnih": MNIH}
+
+
 # -------------------------------------------------- eval
 
 
@@ -253,9 +260,12 @@ def evaluate(args: argparse.Namespace) -> int:
     q, gif = load_pilot(args), args.out / "flight.gif"
     world, rng = World(beacon=args.beacon), np.random.default_rng(0)
     seeds = range(args.first_seed, args.first_seed + args.episodes)
-    pilots = {"straight": env.straight_pilot, "laser": env.laser_pilot, "dqn": dqn_pilot(q)}
+    pilots = {"straight": env.straight_pilot, "laser": env.laser_pilot(DQNConfig.gamma)}
+    pilots["dqn"] = dqn_pilot(q)
     bar = fly_random(seeds, world, rng)
-    flights = {p: bar if p == "random" else fly(pilots[p], seeds, world) for p in args.pilots}
+    flights: dict[str, Flights] = {}
+    for p in args.pilots:
+        flights[p] = bar if p == "random" else fly(pilots[p], seeds, world, camera=p == "dqn")
     draws = rng.integers(len(seeds), size=(2000, len(seeds)))  # (2000, forests) resampled
     figures = {p: summarize(flights[p], bar, draws) for p in flights}
     many = f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n"
@@ -268,11 +278,11 @@ def evaluate(args: argparse.Namespace) -> int:
         with dqn.whole_file(args.json) as file:
             file.write(json.dumps(report).encode())
     say(f"\nwrote {args.json}" if args.json else "")
-    best = int(measure(flights[args.pilots[-1]])["crossed"].argmax())  # the first to cross, or 0
+    shown = int(measure(flights[args.pilots[-1]])["crossed"].argmax())  # the first to cross, or 0
     with dqn.whole_file(gif) as file:
-        pictures = film({p: flights[p][best] for p in flights}, world, q)
+        pictures = film({p: flights[p][shown] for p in flights}, world, q)
         render.save_film(file, pictures, round(1000 * world.dt))
-    say(f"wrote {gif}: forest {seeds[best]}, {args.pilots[-1]}")
+    say(f"wrote {gif}: forest {seeds[shown]}, {args.pilots[-1]}")
     return 0
 
 

@@ -14,21 +14,22 @@ from env import (
     Fleet,
     ForestEnv,
     World,
-    dynamic_window,
     fly,
     fly_random,
+    gaps,
     laser_pilot,
     measure,
+    plan,
     plant,
     random_pilot,
     refly,
     reward,
     straight_pilot,
+    ways,
 )
 
 WORLD = World()
 CLEARING = replace(WORLD, rows=0)  # no trunks
-OPEN = (np.linspace(0, 2 * math.pi, 360, endpoint=False), np.full(360, 20.0))  # a scan of nothing
 
 
 def flown(env: ForestEnv, actions: Sequence[int], seed: int = 0) -> tuple:
@@ -406,29 +407,77 @@ def test_a_fleet_needs_an_action_for_each_drone_in_the_air() -> None:
 # -------------------------------------------------- pilots
 
 
-def test_in_the_open_the_laser_pilot_turns_to_the_goal() -> None:
-    assert dynamic_window(*OPEN, 0.0, WORLD) == 4
-    assert dynamic_window(*OPEN, 2.0, WORLD) == 8
-    assert dynamic_window(*OPEN, -2.0, WORLD) == 0
+GAMMA = 0.99
 
 
-def test_the_laser_pilot_looks_one_and_a_half_seconds_ahead_at_any_control_rate() -> None:
+def best(env: ForestEnv) -> int:
+    """What the planner takes where this drone is."""
+    return int(plan(*env.scan(), env.pose, env.world, GAMMA).argmax())
+
+
+@pytest.mark.parametrize("start", ["", "4" * 160, "444444448" + "4" * 36, "4" * 30 + "0" * 20])
+def test_a_way_is_worth_the_rewards_that_the_world_pays_for_it(start: str) -> None:
+    """81 ways in each of four places: the start, near the goal, near a side, facing a side."""
+    env = ForestEnv(replace(CLEARING, actions=9), camera=False)
+    flown(env, list(map(int, start)) or [4])
+    values = plan(*env.scan(), env.pose, CLEARING, GAMMA)
+    for first in range(9):
+        worths = []
+        for then in range(9):
+            flown(env, list(map(int, start)) or [4])
+            worth, k = 0.0, 0
+            for a in [first] * 6 + [then] * 16:
+                if not env.outcome:
+                    worth, k = worth + GAMMA**k * env.step(a)[1], k + 1
+            x, y, heading = env.pose
+            turn = abs(math.remainder(math.atan2(-y, 90 - x) - heading, math.tau)) / 0.7  # s
+            more = 0 if env.outcome else 10 * (turn + math.hypot(90 - x, y) / 5)  # steps
+            if env.outcome != "left":
+                worth += GAMMA ** (k + more) * 1.25 / (1 - GAMMA)
+            worths.append(worth)
+        assert values[first] == pytest.approx(max(worths))
+
+
+def test_in_the_open_the_planner_turns_to_the_goal() -> None:
+    env = ForestEnv(CLEARING, camera=False)
+    for heading, action in ((0.0, 4), (-2.0, 8), (2.0, 0)):
+        env.reset(seed=0)
+        env.pose = (45.0, 0.0, heading)
+        assert best(env) == action
+
+
+def test_the_planner_turns_away_from_a_trunk_ahead_and_before_a_side_edge() -> None:
+    env = ForestEnv(CLEARING, camera=False)
+    env.reset(seed=0)
+    for left in (0.3, -0.3):
+        env.trunks = np.array([[6.0, left]])
+        assert (best(env) - 4) * left < 0
+        env.trunks, env.pose = np.zeros((0, 2)), (45.0, math.copysign(20.0, left), left)
+        assert (best(env) - 4) * left < 0
+        env.pose = (0.0, 0.0, 0.0)
+
+
+def test_the_distances_to_bark_are_those_of_brute_force() -> None:
+    rng = np.random.default_rng(0)
+    at, bark = (rng.normal(0, 9, shape) @ [1, 1j] for shape in ((5, 7, 2), (30, 2)))
+    expected = np.minimum(np.abs(at[..., None] - bark).min(-1), 2.0)
+    assert gaps(at, bark, 2.0) == pytest.approx(expected)
+    assert (gaps(at, bark[:0], 20.0) == 20.0).all()
+
+
+def test_the_planner_sees_2_2_s_ahead_at_any_control_rate() -> None:
     for rate in (10, 30, 50):
-        world = World(dt=1 / rate)
-        assert dynamic_window(*OPEN, 0.35 * 1.5, world) == 6, "0.35 rad/s for 1.5 s"
-
-
-def test_the_laser_pilot_turns_away_from_a_trunk_ahead() -> None:
-    bearings, distances = OPEN[0], OPEN[1].copy()
-    distances[:12] = 4.0  # bark from dead ahead to 12 degrees left
-    assert dynamic_window(bearings, distances, 0.0, WORLD) < 4
-    assert dynamic_window(bearings, np.roll(distances, -11), 0.0, WORLD) > 4
+        at, headings = ways(World(dt=1 / rate))
+        assert at.shape == headings.shape == (81, round(2.2 * rate))
+        assert headings[0, -1] == pytest.approx(-0.7 * 2.2)
+        assert at[40, -1] == pytest.approx(11.0)
 
 
 def test_the_laser_pilot_arrives_and_never_crashes() -> None:
-    flights = fly(laser_pilot, range(2 * 10**9, 2 * 10**9 + 20), WORLD, camera=False)
+    flights = fly(laser_pilot(GAMMA), range(2 * 10**9, 2 * 10**9 + 20), WORLD, camera=False)
     assert not any(f["outcome"] == "crash" for f in flights)
-    assert sum(f["outcome"] == "goal" for f in flights) >= 17
+    assert sum(f["outcome"] == "goal" for f in flights) >= 18
+    assert sum(f["return"] for f in flights) / 20 > 70
 
 
 def test_the_random_pilot_draws_its_actions_uniformly() -> None:

@@ -32,7 +32,7 @@ import numpy as np
 import torch
 
 from deepflight import EVAL_FIRST, dqn_pilot
-from dqn import load_weights
+from dqn import DQNConfig, load_weights
 from env import (
     Flights,
     ForestEnv,
@@ -64,7 +64,7 @@ def forest(density: float, speed: float, beacon: bool) -> World:
 def pilot(name: str) -> Pilot:
     """By name."""
     if name == "laser":
-        return laser_pilot
+        return laser_pilot(DQNConfig.gamma)
     if name == "random":
         return random_pilot(np.random.default_rng(0))
     beacon = name.endswith("beacon")

@@ -1,6 +1,6 @@
 """What does the control rate do? Random, straight and laser flights at 10, 30 and 50 Hz.
 
-    .venv/bin/python -m extras.experiments.clock_rate    # two minutes; no training
+    .venv/bin/python -m extras.experiments.clock_rate    # ten minutes; no training
 
 The paper does not say how often its drone decides. It trained for 1.4 million control steps in
 6,200 episodes, which is 226 steps an episode [DF §III]. Ours flies at 10 Hz. Its random flights are
@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from deepflight import summarize
+from dqn import DQNConfig
 from env import World, fly, fly_random, laser_pilot, straight_pilot
 
 ROOT = Path(__file__).parents[2]
@@ -24,14 +25,15 @@ SEEDS = range(4 * 10**9, 4 * 10**9 + 200)
 RATES = (10, 30, 50)  # Hz
 SECONDS = 100  # then a flight is truncated, at every rate
 PAPER = 1_400_000 / 6_200  # steps an episode
-PILOTS = {"straight": straight_pilot, "laser": laser_pilot}
 
 
 def fly_at(rate: int) -> dict[str, dict]:
     """The figures of all three pilots at one control rate, as `eval` gives them."""
     world, rng = World(dt=1 / rate, max_steps=SECONDS * rate), np.random.default_rng(0)
     bar = fly_random(SEEDS, world, rng)
-    flights = {name: fly(PILOTS[name], SEEDS, world, camera=False) for name in PILOTS}
+    gamma = DQNConfig.gamma ** (1 / rate / World.dt)  # the same discount a second
+    pilots = {"straight": straight_pilot, "laser": laser_pilot(gamma)}
+    flights = {name: fly(pilots[name], SEEDS, world, camera=False) for name in pilots}
     draws = rng.integers(len(SEEDS), size=(2000, len(SEEDS)))  # (2000, forests)
     return {name: summarize(x, bar, draws) for name, x in ({"random": bar} | flights).items()}
 

@@ -10,9 +10,10 @@ hardly learn from rewards. Asked in forests it has not seen, in the middle (15 m
 every edge) and at the edges (10 m or less from one, and heading for it): how far off it is, and
 which edge it takes the edge for.
 
-And what a compass is worth: how many flights cross by the laser pilot's rule if it flies straight
-on, whichever way it has come to face; if it turns back to the x axis; and if it turns back along
-the rows, whichever way along them is nearer. Writes results/compass.json.
+And what a compass is worth: how many flights cross by the laser pilot's plan if it takes the middle
+of the forest for its place, and for its heading either 0, whichever way it has come to face; or its
+true heading; or its angle to the rows, whichever way along them is nearer. Writes
+results/compass.json.
 """
 
 import json
@@ -23,8 +24,8 @@ import torch
 import torch.nn.functional as F
 
 from deepflight import EVAL_FIRST, TRAIN_END
-from dqn import QNetwork, linear_schedule
-from env import STACK, Fleet, World, dynamic_window, fly, measure, plant
+from dqn import DQNConfig, QNetwork, linear_schedule
+from env import STACK, Fleet, World, fly, measure, plan, plant
 from render import camera
 
 ROOT = Path(__file__).parents[2]
@@ -86,10 +87,12 @@ def crossed(fold: int) -> float:
     compass, 2 along the rows whichever way is nearer."""
 
     def pilot(fleet: Fleet) -> list[int]:
-        envs = fleet.flying
-        turns = [np.angle(np.exp(-1j * fold * env.pose[2])) for env in envs]  # rad
-        ways = [turn / max(fold, 1) for turn in turns]  # rad
-        return [dynamic_window(*e.scan(), way, WORLD) for e, way in zip(envs, ways, strict=True)]
+        actions = []
+        for env in fleet.flying:
+            heading = np.angle(np.exp(1j * fold * env.pose[2])) / max(fold, 1)  # rad
+            pose = (WORLD.length / 2, 0.0, heading)
+            actions.append(int(plan(*env.scan(), pose, WORLD, DQNConfig.gamma).argmax()))
+        return actions
 
     flights = fly(pilot, range(EVAL_FIRST, EVAL_FIRST + FLIGHTS), WORLD, camera=False)
     return float(100 * measure(flights)["crossed"].mean())

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from deepflight import EVAL_FIRST
-from dqn import QNetwork, load, load_weights
+from dqn import DQNConfig, QNetwork, load, load_weights
 from env import World, fly, laser_pilot, refly
 
 ROOT = Path(__file__).parents[2]
@@ -33,7 +33,7 @@ FORESTS = 10
 def frames(beacon: bool, forests: int) -> Tensor:
     """The states (N, 4, 84, 84) uint8 of the laser's flights."""
     world, seeds = World(beacon=beacon), range(EVAL_FIRST, EVAL_FIRST + forests)
-    flights = fly(laser_pilot, seeds, world, camera=False)
+    flights = fly(laser_pilot(DQNConfig.gamma), seeds, world, camera=False)
     states = [s for f in flights for s, *_ in refly(f["seed"], f["actions"], world)]
     return torch.from_numpy(np.stack(states))
 
