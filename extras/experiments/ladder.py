@@ -7,12 +7,12 @@
 `train` trains rung 0, Mnih's own settings, for 1.4 million steps, rungs 1 to 7 with two seeds for
 100,000, and rung 8, the default recipe, with three. Each has one thread, and two run at a time, in
 runs/ladder-RUNG-SEED; those of the recipe in runs/paper, runs/paper-1 and runs/paper-2. Beside the
-rungs it trains the controls: rung 7 with another loss or learning rate. What has been flown is not
-trained again. `fly` flies two networks of each through 200 forests that no training, test or
-evaluation uses: what best.pt keeps, and the newest, which it writes to last.pt. It adds them to
-results/ladder.json, and copies logs and settings to results/. `draw` draws figures/ladder.png: a
-row a rung, a colour a seed, with 95 % intervals over the forests; a dot is best.pt, and a ring the
-newest network.
+rungs it trains the controls: rung 7 with another loss or learning rate, and with two seeds, rung 7
+without the pieces that do not stand out. What has been flown is not trained again. `fly` flies two
+networks of each through 200 forests that no training, test or evaluation uses: what best.pt keeps,
+and the newest, which it writes to last.pt. It adds them to results/ladder.json, and copies logs and
+settings to results/. `draw` draws figures/ladder.png: a row a rung, a colour a seed, with 95 %
+intervals over the forests; a dot is best.pt, and a ring the newest network.
 """
 
 import json
@@ -69,6 +69,7 @@ CONTROLS = {
     "huber 1, a quarter of lr": ["--huber", "1", "--lr", "6e-5"],
     "huber 100": ["--huber", "100"],
     "huber 100, twice the lr": ["--huber", "100", "--lr", "5e-4"],
+    "without rungs 2, 5 and 6": ["--no-double", *"--huber 1 --lr-decay 1 --average 0".split()],
 }
 
 
@@ -94,7 +95,8 @@ def trainings() -> Iterator[tuple[str, str, int, list[str]]]:
     for seed in (*SEEDS, 2):
         yield f"paper-{seed}".removesuffix("-0"), "8 the recipe", seed, []
     for i, (label, more) in enumerate(CONTROLS.items()):
-        yield f"ladder-{'abcdefgh'[i]}-0", label, 0, ["--steps", str(STEPS), *more]
+        for seed in SEEDS if label.startswith("without") else SEEDS[:1]:
+            yield f"ladder-{'abcde'[i]}-{seed}", label, seed, ["--steps", str(STEPS), *more]
 
 
 def train(training: tuple[str, str, int, list[str]]) -> None:
