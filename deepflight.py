@@ -400,7 +400,8 @@ class Run:
         folder.mkdir(parents=True, exist_ok=True)
         for name, mark in RUN_FILES.items():
             for part in folder.glob(f".{name}.{'[0-9a-f]' * 8}.part"):
-                if re.match(mark + b"|$", dqn.head(part), re.DOTALL):  # of a save that was killed
+                ours = re.match(mark + rb"|\Z", dqn.head(part), re.DOTALL)  # of a killed save
+                if ours and part.is_file():
                     dqn.attempt(part.unlink)
         self.save()
         with dqn.whole_file(folder / "config.json") as file:
@@ -588,7 +589,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(prog="deepflight.py", description="Train a pilot, fly it against others.")
     commands = parser.add_subparsers(metavar="train or eval", required=True)
     sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
-    sub.set_defaults(run=start_training, preset="default", name=None, resume=None)
+    sub.set_defaults(run=start_training, preset=None, name=None, resume=None)
     kinds = "dqn: textbook DQN with Adam; mnih: with [Mnih15]'s parameters"
     sub.add_argument("--preset", choices=PRESETS, metavar="NAME", help=kinds)
     sub.add_argument("--name", help="name of the folder in runs/; by default a new number")
@@ -621,13 +622,13 @@ def start_training(args: argparse.Namespace) -> int:
     """Check all that is given before anything is written, then train."""
     given = {f.name: vars(args)[f.name] for f in SETTINGS if f.name in args}
     if args.resume:
-        if given.keys() - {"steps"} or args.name is not None or args.preset != "default":
+        if given.keys() - {"steps"} or args.name is not None or args.preset is not None:
             raise ValueError(f"{args.resume} keeps its own settings: give none but --steps")
         return resume_training(args.resume, given)
     if args.name is not None and not re.fullmatch(r"\w[\w.-]{0,99}", args.name, re.ASCII):
         legal = "100 of a-z, A-Z, 0-9, dot, dash, underscore; the first no dot or dash"
         raise ValueError(f"name is {args.name!r}, allowed are {legal}")
-    preset = (BEACON if given.get("beacon") else {}) | PRESETS[args.preset]
+    preset = (BEACON if given.get("beacon") else {}) | PRESETS[args.preset or "default"]
     c, rc = configure(preset | given)
     numbers = (f"{i:03d}" for i in range(1, 10**6) if not os.path.lexists(f"runs/{i:03d}"))
     folder = Path("runs", args.name or next(numbers))
@@ -676,11 +677,15 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
     for settings in (c, rc):
         env.check_numbers(settings, {f.name: f.metadata["legal"] for f in fields(settings)})
     # The least: three rows to complete a stack, n_steps that wait for rewards, one to draw.
-    window = c.num_envs * (c.n_steps + 4)
-    least = {"replay_size": window, "learning_starts": window, "steps": c.learning_starts + 1}
-    for name in least:
-        if (value := getattr(c, name)) < least[name]:
-            raise ValueError(f"{name} is {value}, allowed are whole numbers from {least[name]}")
+    window, why = c.num_envs * (c.n_steps + 4), "num_envs and n_steps"
+    for name, least, by in (
+        ("replay_size", window, why),
+        ("learning_starts", window, why),
+        ("steps", c.learning_starts + 1, "learning_starts"),
+    ):
+        if (value := getattr(c, name)) < least:
+            text = f"{name} is {value}, allowed are whole numbers from {least}, because of {by}"
+            raise ValueError(text)
     return c, rc
 
 

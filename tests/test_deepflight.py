@@ -232,6 +232,7 @@ train now
 train --resume nowhere
 train --resume runs/taken --name other
 train --resume runs/taken --preset mnih
+train --resume runs/taken --preset default
 train --resume runs/taken --lr 0.1
 train --resume runs/taken
 train --resume paper.pt

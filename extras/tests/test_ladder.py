@@ -19,7 +19,7 @@ def settings(flags: list[str]) -> dict[str, object]:
     """What `train` makes of these flags."""
     args = parse(["train", *flags])
     given = {f.name: vars(args)[f.name] for f in SETTINGS if f.name in args}
-    c, r = configure(PRESETS[args.preset] | given)
+    c, r = configure(PRESETS[args.preset or "default"] | given)
     return asdict(c) | asdict(r)
 
 
