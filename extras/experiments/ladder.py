@@ -69,7 +69,7 @@ CONTROLS = {
     "huber 1, a quarter of lr": ["--huber", "1", "--lr", "6e-5"],
     "huber 100": ["--huber", "100"],
     "huber 100, twice the lr": ["--huber", "100", "--lr", "5e-4"],
-    "without 2, 5, 6": ["--no-double", "--huber", "1", "--lr-decay", "1", "--average", "0"],
+    "without Double, decay, mean": ["--no-double", "--lr-decay", "1", "--average", "0"],
 }
 
 
