@@ -489,7 +489,7 @@ def show(text: str) -> None:
 # A world's numbers may go from 0.001 to 10,000; these have other limits. There are at most ten
 # actions, because a flight's record has one digit per action.
 LIMITS = dict.fromkeys(("first_x", "first_y", "r_safe", "r_precrash", "r_crash"), (-1e4, 1e4))
-LIMITS |= dict.fromkeys(("back", "jitter_x", "jitter_y", "beacon_pixels", "yaw_rate"), (0, 1e4))
+LIMITS |= dict.fromkeys(("back", "jitter_x", "jitter_y", "beacon_pixels"), (0, 1e4))
 LIMITS |= dict.fromkeys(("sky", "ground", "trunk_facing", "trunk_grazing", "beacon_grey"), (0, 255))
 LIMITS |= {"rows": (0, 1e4), "columns": (0, 1e4), "beacon": (0, 1), "actions": (2, 10)}
 

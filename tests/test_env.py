@@ -331,6 +331,7 @@ def test_a_flight_that_is_over_or_not_begun_cannot_go_on() -> None:
         ({"max_steps": 0}, "max_steps"),
         ({"rows": True}, "rows"),
         ({"beacon": 1}, "beacon"),
+        ({"yaw_rate": 0.0}, "yaw_rate"),
     ],
 )
 def test_an_impossible_world_is_refused_by_the_name_of_what_is_wrong(
@@ -571,7 +572,7 @@ WORLDS = st.builds(
     altitude=floats(0.1, 8),
     view=floats(1, 60),
     speed=floats(0.1, 10),
-    yaw_rate=floats(0, 3),
+    yaw_rate=floats(0.01, 3),
     goal_radius=floats(0.1, 5),
     back=floats(0, 5),
     dt=floats(0.02, 0.5),
