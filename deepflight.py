@@ -179,9 +179,8 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 
 
 def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | None = None) -> int:
-    """Algorithm 1 of [Mnih15]. A number in a comment is one of its lines, listed in dqn.py; then
-    comes the shape. folder: of the run's files. saved: a checkpoint to go on with. Returns the exit
-    code."""
+    """Algorithm 1 of [Mnih15]; numbers in comments are its lines, listed in dqn.py. folder: of the
+    run's files. saved: a checkpoint to go on with. Returns the exit code."""
     world, rng = World(beacon=rc.beacon), np.random.default_rng(rc.seed)
     replay = Replay(c.replay_size, c.num_envs)  # 1
     agent = Agent(c, world.actions, rc.seed)  # 2, 3
