@@ -64,6 +64,8 @@ from typing import Any, NoReturn
 import numpy as np
 import torch
 from numpy import ndarray
+from numpy.random import Generator
+from torch import Tensor
 
 import dqn
 import env
@@ -178,49 +180,79 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #                       best.pt; in the last tenth the mean of the weights flies, and is kept
 
 
-def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | None = None) -> int:
+def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: Any = None, demos: Any = ()) -> int:
     """Algorithm 1 of [Mnih15]; numbers in comments are its lines, listed in dqn.py. folder: of the
-    run's files. saved: a checkpoint to go on with. Returns the exit code."""
+    run's files. saved: a checkpoint to go on with. demos: demonstrated flights, an `env.Record`.
+    Returns the exit code."""
     world, rng = World(beacon=rc.beacon), np.random.default_rng(rc.seed)
-    replay = Replay(c.replay_size, c.num_envs)  # 1
+    replay = Replay(c.replay_size, c.num_envs, c.teacher * world.actions)  # 1
     agent = Agent(c, world.actions, rc.seed)  # 2, 3
     fleet = Fleet(world, c.num_envs)  # [+num_envs]
-    run = Run(folder, c, rc, (agent, replay, fleet, rng), saved)
+    demos = saved["demos"] if saved else list(demos)  # [+demos]
+    lesson = recall(demos, c, rc) if demos else None  # a replay of their own
+    run = Run(folder, c, rc, (agent, replay, fleet, rng, demos), saved)
     for step in run.steps():  # 6
         epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
         agent.optimizer.param_groups[0]["lr"] = lr
         fleet.reset(fleet.landed, rng.integers(TRAIN_END, size=len(fleet.landed)))  # 4, 5
-        s = fleet.observations  # (L, 4, 84, 84), because all L drones are in the air
+        s, scores = fleet.observations, teach(fleet, c, rc)  # (L, 4, 84, 84), (L, A) [+teacher]
         explore = rng.random(c.num_envs) < epsilon  # 7 (L,)
         anything = rng.integers(world.actions, size=c.num_envs)  # (L,)
+        anything = scores.argmax(1) if c.teacher else anything  # (L,) [+teacher]
         a = np.where(explore, anything, greedy(agent.q, s))  # 8 (L,)
         s2, r, terminated, truncated, infos = fleet.step(a)  # 9, 10
         r = learner_reward(r, infos, rc, c.gamma)  # (L,)
-        replay.add(s, a, r, s2, terminated, truncated)  # 11
-        updates = run.due(c.update_every) if step >= c.learning_starts else 0
-        for _ in range(updates):
-            batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
-            batch = mirror(batch, world.actions, rng) if c.mirror else batch  # [+mirror]
-            b = dqn.Batch(*map(torch.from_numpy, batch))
-            with torch.no_grad():
-                q2 = agent.q_target(b.s2, agent.bfloat16)  # (B, A) [+bfloat16]
-                q2_online = agent.q(b.s2, agent.bfloat16) if c.double else q2  # (B, A) [+double]
-                y = td_target(b.r, b.gamma_n, b.end, q2, q2_online)  # 13 (B,)
-            q_sa = agent.q(b.s, agent.bfloat16).gather(1, b.a[:, None])[:, 0]  # (B,)
-            agent.loss = torch.nn.functional.smooth_l1_loss(q_sa, y, beta=c.huber)  # 14 [+huber]
-            agent.optimizer.zero_grad()
-            agent.loss.backward()
-            agent.optimizer.step()
-            agent.updates += 1
-            if agent.updates % c.target_every == 0:
-                agent.q_target.load_state_dict(agent.q.state_dict())  # 15
+        replay.add(s, a, r, s2, terminated, truncated, scores)  # 11
+        first = lesson is not None and not agent.updates
+        if first:
+            rehearse(agent, lesson, c, rng)  # [+demos] before all else
+        for _ in range(run.due(c.update_every) if step >= c.learning_starts else 0):
+            learn(agent, draw(replay, lesson, c, rng), c)  # 12 to 15
             if run.last_share:  # [+average]
                 agent.mean.update_parameters(agent.q)
         run.note()
-        if run.due(rc.test_every) or step >= c.steps:
+        if first or run.due(rc.test_every) or step >= c.steps:
             run.test(epsilon)
     return run.finish()
+
+
+def draw(
+    replay: Replay, lesson: Replay | None, c: DQNConfig, rng: Generator
+) -> dqn.Batch:  # fmt: skip
+    """A batch of tensors (line 12). [+demos] A share of it comes from the demonstrations."""
+    shown = round(c.demo_share * c.batch_size) if lesson else 0
+    parts = [(replay, c.batch_size - shown), (lesson, shown)]
+    drawn = [part.sample(n, c.n_steps, c.gamma, rng) for part, n in parts if n]  # [+n_steps]
+    batch = dqn.Batch(*map(np.concatenate, zip(*drawn, strict=True)))
+    batch = mirror(batch, env.World.actions, rng) if c.mirror else batch  # [+mirror]
+    return dqn.Batch(*map(torch.from_numpy, batch))
+
+
+def learn(agent: Agent, b: dqn.Batch, c: DQNConfig) -> None:
+    """Lines 13 to 15: move the weights once, and now and then renew Q^."""
+    q = agent.q(b.s, agent.bfloat16)  # (B, A) [+bfloat16]
+    agent.loss = td_loss(agent, q, b, c) if c.bellman else torch.zeros(())
+    if c.teacher:  # [+teacher]
+        agent.loss = agent.loss + dqn.teacher_loss(q, b.scores)
+    if b.shown.any():  # [+demos]
+        agent.loss = agent.loss + (b.shown * dqn.margin_loss(q, b.a, c.margin)).mean()
+    agent.optimizer.zero_grad()
+    agent.loss.backward()
+    agent.optimizer.step()
+    agent.updates += 1
+    if agent.updates % c.target_every == 0:
+        agent.q_target.load_state_dict(agent.q.state_dict())  # 15
+
+
+def td_loss(agent: Agent, q: Tensor, b: dqn.Batch, c: DQNConfig) -> Tensor:
+    """How far Q is from its labels. q (B, A): Q(s, .)."""
+    with torch.no_grad():
+        q2 = agent.q_target(b.s2, agent.bfloat16)  # (B, A)
+        q2_online = agent.q(b.s2, agent.bfloat16) if c.double else q2  # (B, A) [+double]
+        y = td_target(b.r, b.gamma_n, b.end, q2, q2_online)  # 13 (B,)
+    q_sa = q.gather(1, b.a[:, None])[:, 0]  # (B,)
+    return torch.nn.functional.smooth_l1_loss(q_sa, y, beta=c.huber)  # 14 [+huber]
 
 
 # -------------------------------------------------- other settings
@@ -229,6 +261,14 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: dict[str, Any] | Non
 # paid either: a pilot that is paid for them flies past the goal. Finding the goal takes longer to
 # learn.
 BEACON = {"steps": 400_000, "forward_reward": 0.0, "far_value": 50.0}
+# A teacher acts where Q would explore, until Q acts alone. Less pay for metres and for the far edge
+# is enough, because the teacher can see that edge; so the reward that the paper pays counts more.
+TEACHER = dict(
+    bellman=False, learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000,
+    lr_decay=0.0, test_every=20_000, forward_reward=1.0, far_value=125.0,
+)  # fmt: skip
+# Whoever has seen demonstrations need not begin by chance.
+DEMOS = {"epsilon_decay": 1}
 # Textbook DQN on the paper's reward, with Adam. What is only quicker stays: eight drones fly side
 # by side, in bfloat16.
 DQN = dict(
@@ -244,6 +284,75 @@ MNIH = DQN | dict(
     epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, bfloat16=False,
 )  # fmt: skip
 PRESETS = {"default": {}, "dqn": DQN, "mnih": MNIH}
+# What these flags change, unless told otherwise; a later one outdoes an earlier one.
+FLAGS = {"teacher": TEACHER, "demos": DEMOS, "beacon": BEACON}
+
+
+# -------------------------------------------------- a teacher, demonstrations [DF §IV]
+
+
+def teach(fleet: Fleet, c: DQNConfig, rc: RunConfig) -> ndarray | float:
+    """[+teacher] What each action is worth to the drones in the air (F, A). `env.plan` plans by
+    what the network is paid. Without a teacher: 0."""
+    if not c.teacher:
+        return 0.0
+    return env.teach(fleet, c.gamma, rc.forward_reward, rc.goal_value, rc.far_value)
+
+
+def rehearse(agent: Agent, lesson: Replay, c: DQNConfig, rng: Generator) -> None:
+    """[+demos] Learn from demonstrated flights alone."""
+    for i in range(c.demo_updates):
+        show(f"learning from demonstrations: {i:,} of {c.demo_updates:,} updates")
+        learn(agent, draw(lesson, None, c, rng), c)
+
+
+def recall(demos: env.Record, c: DQNConfig, rc: RunConfig) -> Replay:
+    """[+demos] A replay of demonstrated flights, in one lane, made by flying them again."""
+    steps, fleet = sum(len(actions) for _, actions in demos), Fleet(World(beacon=rc.beacon), 1)
+    lesson = Replay(steps, 1, c.teacher * env.World.actions, shown=True)
+    for i, (seed, actions) in enumerate(demos):
+        show(f"flying demonstration {i + 1:,} of {len(demos):,}")
+        fleet.reset([0], [seed])
+        for action in actions:
+            remember(lesson, fleet, [int(action)], c, rc)
+    show("")
+    return lesson
+
+
+def remember(replay: Replay, fleet: Fleet, a: list[int], c: DQNConfig, rc: RunConfig) -> None:
+    """Fly a step whose actions (L,) are known, and write it into a replay."""
+    s, scores = fleet.observations, teach(fleet, c, rc)  # (L, 4, 84, 84), (L, A)
+    s2, r, terminated, truncated, infos = fleet.step(a)
+    r = learner_reward(r, infos, rc, c.gamma)  # (L,)
+    replay.add(s, a, r, s2, terminated, truncated, scores)
+
+
+def read_demos(path: Path, beacon: bool, least: int) -> env.Record:
+    """The flights of a file that `eval --json` wrote. Raises ValueError unless they fly again as it
+    says, in this world, through forests of training's range, and have so many steps at least."""
+    if not path.is_file():
+        raise ValueError(f"{path} is no file of flights, such as eval --json writes")
+    try:
+        report = json.loads(path.read_bytes())
+        flights = [flight for pilot in report["pilots"].values() for flight in pilot["flights"]]
+        demos = [(flight["seed"], flight["actions"]) for flight in flights]
+        ends = [(flight["outcome"], flight["edge"]) for flight in flights]
+        if report["beacon"] is not beacon:
+            raise ValueError(f"it was flown with beacon {report['beacon']}, here is {beacon}")
+        dqn.check_like(demos, [(0, "")], "a flight")
+        for i, (seed, actions) in enumerate(demos):
+            show(f"checking demonstration {i + 1:,} of {len(demos):,}")
+            env.whole_number("seed", seed, TRAIN_END - 1)
+            *_, (*_, info) = refly(seed, actions, World(beacon=beacon), camera=False)
+            if (info["outcome"], info["edge"]) != ends[i] or not info["outcome"]:
+                raise ValueError(f"flight {i + 1} does not end by {ends[i][0]} if flown again")
+        if (steps := sum(len(actions) for _, actions in demos)) < least:
+            raise ValueError(f"it holds {steps} steps, needed are {least} or more")
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        other = getattr(error, "strerror", None) or "eval --json did not write it"
+        why = error if isinstance(error, ValueError) else other
+        raise ValueError(f"{path} cannot be learnt from: {why}") from None
+    return demos
 
 
 # -------------------------------------------------- eval
@@ -392,7 +501,7 @@ class Run:
         torch.set_flush_denormal(True)  # else RMSprop's dead moments, below 1e-38, halve the speed
         torch.set_num_threads(rc.threads)
         self.folder, self.c, self.rc, self.stopped = folder, c, rc, 0
-        self.agent, self.replay, self.fleet, self.rng = parts
+        self.agent, self.replay, self.fleet, self.rng, self.demos = parts
         self.book = {"step": 0, "episodes": 0, "seconds": 0.0, "recent": [], "log": [], "best": []}
         if saved:
             self.restore(saved)
@@ -482,7 +591,8 @@ class Run:
         """What a checkpoint holds: 34 MB; of the replay only each flight's seed and actions."""
         content = {"settings": asdict(self.c) | asdict(self.rc), "machine": dqn.MACHINE}
         content |= {"agent": dict(self.agent.state_dict()), "rng": self.rng.bit_generator.state}
-        return content | {"flights": self.fleet.record(self.replay.rows), "book": self.book}
+        content |= {"flights": self.fleet.record(self.replay.rows), "demos": self.demos}
+        return content | {"book": self.book}
 
     def save(self) -> None:
         """Write the checkpoint."""
@@ -491,7 +601,7 @@ class Run:
     def restore(self, saved: dict[str, Any]) -> None:
         """Check that a checkpoint is like one of ours, and set everything as it was."""
         flight = self.fleet.envs[0].flight()
-        like = self.content() | {"flights": [[(0, "")]]}
+        like = self.content() | {"flights": [[(0, "")]], "demos": [(0, "")]}
         like["book"] = self.book | {"recent": [flight], "log": [""], "best": [0.0]}
         dqn.check_like(saved, like, self.folder / "checkpoint.pt")
         self.book = saved["book"]
@@ -521,16 +631,15 @@ class Run:
         for row in range(-rows, 0):
             show(f"flying the replay again: {-row * len(digits):,} steps to go")
             fleet.reset(fleet.landed, [next(seeds[lane], 0) for lane in fleet.landed])
-            s, a = fleet.observations, [int(actions[row]) for actions in digits]
-            s2, r, terminated, truncated, infos = fleet.step(a)
-            r = learner_reward(r, infos, self.rc, self.c.gamma)
-            replay.add(s, a, r, s2, terminated, truncated)
+            remember(replay, fleet, [int(actions[row]) for actions in digits], self.c, self.rc)
         show("")
         if fleet.record(replay.rows) != flights:
             raise ValueError("other flights")
 
     def finish(self) -> int:
         """The exit code: 0; or, saved and with the command that goes on, 128 and the signal."""
+        if self.c.teacher:
+            say(f"the teacher labelled {self.book['step']:,} states")
         if not self.stopped or self.book["step"] >= self.c.steps:
             return 0
         self.save()
@@ -578,7 +687,7 @@ def place(text: str) -> Path:
 def describe(f: Field) -> str:
     """The help of a setting's flag: what it is, what is allowed, what the presets make of it."""
     legal = "{:,g} to {:,g}".format(*f.metadata["legal"]) if f.type is not bool else "true or false"
-    presets = PRESETS | {"beacon": BEACON}
+    presets = PRESETS | FLAGS
     changes = [f"; {name} {presets[name][f.name]}" for name in presets if f.name in presets[name]]
     return f"{f.metadata['help']} ({legal}; default {f.default}{''.join(changes)})"
 
@@ -588,11 +697,13 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(prog="deepflight.py", description="Train a pilot, fly it against others.")
     commands = parser.add_subparsers(metavar="train or eval", required=True)
     sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
-    sub.set_defaults(run=start_training, preset=None, name=None, resume=None)
+    sub.set_defaults(run=start_training, preset=None, name=None, resume=None, demos=None)
     kinds = "dqn: textbook DQN with Adam; mnih: with [Mnih15]'s parameters"
     sub.add_argument("--preset", choices=PRESETS, metavar="NAME", help=kinds)
     sub.add_argument("--name", help="name of the folder in runs/; by default a new number")
     sub.add_argument("--resume", type=place, help="folder of a training to go on with")
+    of = "learn first, and beside its own, from the flights of a file of eval --json"
+    sub.add_argument("--demos", type=place, metavar="FILE", help=of)
     for f in SETTINGS:
         kind = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type}
         kind |= {} if f.type is bool else {"metavar": "N" if f.type is int else "X"}
@@ -621,14 +732,16 @@ def start_training(args: argparse.Namespace) -> int:
     """Check all that is given before anything is written, then train."""
     given = {f.name: vars(args)[f.name] for f in SETTINGS if f.name in args}
     if args.resume:
-        if given.keys() - {"steps"} or args.name is not None or args.preset is not None:
+        if given.keys() - {"steps"} or {args.name, args.preset, args.demos} != {None}:
             raise ValueError(f"{args.resume} keeps its own settings: give none but --steps")
         return resume_training(args.resume, given)
     if args.name is not None and not re.fullmatch(r"\w[\w.-]{0,99}", args.name, re.ASCII):
         legal = "100 of a-z, A-Z, 0-9, dot, dash, underscore; the first no dot or dash"
         raise ValueError(f"name is {args.name!r}, allowed are {legal}")
-    preset = (BEACON if given.get("beacon") else {}) | PRESETS[args.preset or "default"]
-    c, rc = configure(preset | given)
+    changed = [FLAGS[name] for name in FLAGS if vars(args).get(name)]
+    changed += [PRESETS[args.preset or "default"], given]
+    c, rc = configure({key: value for changes in changed for key, value in changes.items()})
+    demos = read_demos(args.demos, rc.beacon, c.n_steps + 4) if args.demos else []
     numbers = (f"{i:03d}" for i in range(1, 10**6) if not os.path.lexists(f"runs/{i:03d}"))
     folder = Path("runs", args.name or next(numbers))
     made = [path for path in (folder, folder.parent) if not os.path.exists(path)]
@@ -636,7 +749,7 @@ def start_training(args: argparse.Namespace) -> int:
         make_folder(folder)
         args.resume = folder  # should it be interrupted
         with dqn.lock_folder(folder):
-            return train(c, rc, folder)
+            return train(c, rc, folder, demos=demos)
     finally:
         for path in made:
             with suppress(OSError):  # something has been saved there
@@ -663,6 +776,7 @@ def resume_training(folder: Path, given: dict[str, Any]) -> int:
             dqn.check_output(folder / name, mark)
         saved = dqn.load(folder / "checkpoint.pt", "checkpoint")
         like = {"settings": asdict(DQNConfig()) | asdict(RunConfig()), "machine": dqn.MACHINE}
+        like["demos"] = [(0, "")]
         dqn.check_like({key: saved.get(key) for key in like}, like, folder / "checkpoint.pt")
         if saved["machine"] != dqn.MACHINE:
             raise ValueError(f"{folder} is of {saved['machine']}, here is {dqn.MACHINE}")
@@ -685,6 +799,8 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
         if (value := getattr(c, name)) < least:
             text = f"{name} is {value}, allowed are whole numbers from {least}, because of {by}"
             raise ValueError(text)
+    if not c.bellman and not c.teacher:
+        raise ValueError("bellman is False, allowed is True, because there is no teacher")
     return c, rc
 
 

@@ -170,6 +170,11 @@ class DQNConfig:
     huber: float = setting(10.0, "[+] delta: larger errors pull no harder; 1: Mnih's", 1e-3, 1e6)
     lr_decay: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
     average: float = setting(0.1, "[+] last share of the steps, averaged to fly; 0: off", 0, 0.5)
+    teacher: bool = setting(False, "[+] a planner says what each action is worth", 0, 1)
+    bellman: bool = setting(True, "learn from rewards; --no-bellman: from others alone", 0, 1)
+    demo_updates: int = setting(2_000, "updates on --demos alone, before all others", 1)
+    demo_share: float = setting(0.25, "share of --demos in every later batch", 0, 1)
+    margin: float = setting(5.0, "by which a demonstrated action must be the best", 0, 1e3)
     bfloat16: bool = setting(True, "[+] quick convolutions if the CPU has it; --no-bfloat16", 0, 1)
 
 
@@ -233,6 +238,29 @@ def td_target(r: Tensor, gamma_n: Tensor, end: Tensor, q2: Tensor, q2_online: Te
     return r + gamma_n * torch.where(end == TERMINAL, 0.0, v2)
 
 
+def margin_loss(q: Tensor, a: Tensor, margin: float) -> Tensor:
+    """[+demos] The large-margin loss of [Hester 2018], (B,). Somebody took action a (B,), so its Q
+    should be the greatest, by the margin at least: 0 where it is, else by how much that is missed.
+    q (B, A).
+
+    >>> q = torch.tensor([[1.0, 9.0, 0.0]])
+    >>> [margin_loss(q, torch.tensor([a]), 5.0).item() for a in (0, 1)]
+    [13.0, 0.0]
+    """
+    others = 1 - nn.functional.one_hot(a, q.shape[1])  # (B, A)
+    return (q + margin * others).amax(1) - q.gather(1, a[:, None])[:, 0]
+
+
+def teacher_loss(q: Tensor, scores: Tensor) -> Tensor:
+    """[+teacher] How far the values q (B, A) are from a teacher's scores (B, A), in all but their
+    level: the teacher says by how much one action is better than another, and rewards say how good
+    the state is. An action that is 20 worse than the best or more counts as 20 worse.
+    """
+    scores = (scores - scores.amax(1, keepdim=True)).clamp(-20)  # (B, A) 0 for the best
+    q, scores = (x - x.mean(1, keepdim=True) for x in (q, scores))  # (B, A), (B, A)
+    return nn.functional.smooth_l1_loss(q, scores, beta=10.0)
+
+
 def linear_schedule(step: int, first: float, final: float, steps: int) -> float:
     """The schedule of epsilon and the learning rate: from first to final in steps, then constant.
 
@@ -251,6 +279,8 @@ class Batch(NamedTuple):
     s2: ndarray  # (B, 4, 84, 84) uint8, meaningless after TERMINAL
     gamma_n: ndarray  # (B,) float32
     end: ndarray  # (B,) uint8
+    scores: ndarray  # (B, A) float32, what a teacher said; (B, 0) without one
+    shown: ndarray  # (B,) bool, whether a was demonstrated
 
 
 class Replay:
@@ -278,7 +308,7 @@ class Replay:
         window of row 3, n = 2: r = 0 + gamma * 0, and s2 is the stack of row 5
     """
 
-    def __init__(self, capacity: int, lanes: int) -> None:
+    def __init__(self, capacity: int, lanes: int, scores: int = 0, shown: bool = False) -> None:
         shape = (capacity // lanes, lanes)
         try:
             self.frames = np.empty((*shape, 84, 84), np.uint8)  # (T, L, 84, 84)
@@ -287,16 +317,19 @@ class Replay:
         self.actions = np.zeros(shape, np.uint8)  # (T, L)
         self.rewards = np.zeros(shape, np.float32)  # (T, L)
         self.ends = np.zeros(shape, np.uint8)  # (T, L)
+        self.scores, self.shown = np.zeros((*shape, scores), np.float32), shown  # (T, L, A or 0)
         self.last_frames: dict[tuple[int, int], ndarray] = {}  # (row, lane) -> (84, 84)
         self.rows, self.lanes = shape
         self.added = 0  # rows ever written
 
     def add(
         self, s: ndarray, a: ndarray, r: ndarray, s2: ndarray,
-        terminated: ndarray, truncated: ndarray,
+        terminated: ndarray, truncated: ndarray, scores: ndarray | float = 0.0,
     ) -> None:  # fmt: skip
-        """Write one transition per lane (line 11): s, s2 (L, 4, 84, 84), all others (L,)."""
+        """Write one transition per lane (line 11): s, s2 (L, 4, 84, 84), scores (L, A), all others
+        (L,)."""
         row = self.added % self.rows
+        self.scores[row] = scores
         self.frames[row], self.actions[row], self.rewards[row] = s[:, -1], a, r
         self.ends[row] = np.where(terminated, TERMINAL, np.where(truncated, TRUNCATED, LIVE))
         for lane in range(self.lanes):
@@ -342,7 +375,8 @@ class Replay:
         for i in np.flatnonzero(end == TRUNCATED):  # the last row's state, and one more picture
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], lane[i]]]
         a = self.actions[row, lane].astype(np.int64)  # (B,)
-        return Batch(self.stack(row, lane), a, r, s2, gamma_n, end)
+        scores, shown = self.scores[row, lane], np.full(len(row), self.shown)  # (B, A), (B,)
+        return Batch(self.stack(row, lane), a, r, s2, gamma_n, end, scores, shown)
 
     def stack(self, row: ndarray, lane: ndarray) -> ndarray:
         """The states (B, 4, 84, 84) at row (B,), lane (B,); a flight's first picture repeats."""
@@ -394,6 +428,7 @@ def mirror(batch: Batch, actions: int, rng: Generator) -> Batch:
     for frames in (batch.s, batch.s2):
         frames[flip] = frames[flip, ..., ::-1]
     batch.a[flip] = actions - 1 - batch.a[flip]
+    batch.scores[flip] = batch.scores[flip, ::-1]
     return batch
 
 

@@ -80,6 +80,7 @@ from numpy import ndarray
 from render import PIXELS, Scene, camera, raycast
 
 STACK = 4  # pictures in an observation [DF §II-A]
+Record = list[tuple[int, str]]  # flights: seed and actions of each, which are all of it
 OUTCOMES = ("crash", "goal", "left", "time")  # tested in this order; left: the forest, by an edge
 
 
@@ -352,7 +353,7 @@ class Fleet:
         truncated = np.array([env.truncated for env in envs])  # (F,)
         return s2, r, terminated, truncated, [env.info() for env in envs]
 
-    def record(self, steps: int) -> list[list[tuple[int, str]]]:
+    def record(self, steps: int) -> list[Record]:
         """Of each lane, the flights that its last steps belong to, as seeds and actions. A
         checkpoint keeps these."""
         for flights in self.records:
@@ -379,24 +380,37 @@ def straight_pilot(fleet: Fleet) -> Sequence[int]:
 
 
 def laser_pilot(gamma: float) -> Pilot:
-    """A planner, the bar for the camera: it takes the yaw rate that `plan` values most."""
-    return lambda fleet: [
-        int(plan(*e.scan(), e.pose, e.world, gamma).argmax()) for e in fleet.flying
-    ]
+    """A planner, the bar for the camera: it takes the yaw rate that `plan` values most. Arrival is
+    worth as much as the most that a step can earn, for ever."""
+
+    def act(fleet: Fleet) -> ndarray:
+        goal_value = (fleet.world.r_safe + 1) / (1 - gamma)
+        return teach(fleet, gamma, 0.0, goal_value, 0.0).argmax(1)
+
+    return act
 
 
-def plan(bearings: ndarray, distances: ndarray, pose: tuple, world: World, gamma: float) -> ndarray:
+def teach(fleet: Fleet, gamma: float, *paid: float) -> ndarray:
+    """What `plan` says to each of F drones: (F, A)."""
+    return np.array([plan(*e.scan(), e.pose, e.world, gamma, *paid) for e in fleet.flying])
+
+
+def plan(
+    bearings: ndarray, distances: ndarray, pose: tuple, world: World,
+    gamma: float, forward_reward: float, goal_value: float, far_value: float,
+) -> ndarray:  # fmt: skip
     """What each yaw rate is worth (A,) to a drone that has a laser scanner and knows its pose.
-    bearings, distances (beams,): the scan. pose: x, y, heading.
+    bearings, distances (beams,): the scan. pose: x, y, heading. forward_reward, goal_value,
+    far_value: what is paid beside the paper's reward, as `learner_reward` in deepflight.py says.
 
     It adds up the rewards to come. A way is one of the yaw rates for 0.6 s, then one for 1.6 s: W =
     A * A ways of T steps. It ends early where it crashes, leaves or arrives. The reward of step k
-    counts gamma^k times. A way that is not lost is worth more than that: as if the drone turned to
-    the goal, flew straight to it without reward, and stayed there for ever with the most that a
-    step can earn, 1.25 (as `learner_reward` in deepflight.py says of arrival). A yaw rate is worth
-    what the best way is worth that begins with it.
-    In numbers: straight on from the start, far from trunks. 22 steps earn 6.2. The goal is then
-    79 m or 158 steps away, so 0.99^(22 + 158) * 1.25 / (1 - 0.99) = 20.5 more: 26.7.
+    counts gamma^k times. A way that is not over is worth more than its rewards: as if the drone
+    turned to the goal, flew straight to it without reward, and arrived there; or so to the far
+    edge, if that is worth more. A yaw rate is worth what the best way is worth that begins with it.
+    In numbers, where arrival is worth 125 and nothing else is paid: straight on from the start, far
+    from trunks. 22 steps earn 6.2. The goal is then 79 m or 158 steps away, so 0.99^(22 + 158) *
+    125 = 20.5 more: 26.7.
     """
     # A place is the complex number x + iy, in m. A product with exp(i psi) turns it left by psi.
     (ahead, turned), here, heading = ways(world), complex(*pose[:2]), pose[2]
@@ -404,23 +418,31 @@ def plan(bearings: ndarray, distances: ndarray, pose: tuple, world: World, gamma
     beams = here + distances * np.exp(1j * (heading + bearings))  # (beams,) where they end
     bark = beams[distances < world.laser_range][:, None, None]  # (P, 1, 1)
     d_obs = np.abs(at - bark).min(0, initial=np.inf)  # (W, T) m
-    to_goal, x, y = world.length - at, at.real, np.abs(at.imag)  # (W, T) each
-    outside = (x > world.length) | (x < -world.back) | (y > world.width / 2)  # (W, T)
+    d_goal, x, y = np.abs(world.length - at), at.real, np.abs(at.imag)  # (W, T) m each
     # 0.1 m to spare: the scan shows the near sides of trunks only, and points 0.1 m apart there.
-    crash = d_obs < world.d_crash + 0.1  # (W, T)
-    d_goal = np.abs(to_goal)  # (W, T) m
-    arrived = d_goal < world.goal_radius  # (W, T)
-    lost = crash | (outside & ~arrived)  # (W, T)
-    over, k = lost | arrived, np.arange(at.shape[1])  # (W, T), (T,)
+    crash, arrived = d_obs < world.d_crash + 0.1, d_goal < world.goal_radius  # (W, T), (W, T)
+    far, side = x > world.length, (x < -world.back) | (y > world.width / 2)  # (W, T), (W, T)
+    over, k = crash | arrived | far | side, np.arange(at.shape[1])  # (W, T), (T,)
     over[:, -1] = True
     last = over.argmax(1)[:, None]  # (W, 1) the first step that is over
+    lost = crash | ((far | side) & ~arrived)  # (W, T)
     r = np.where(lost, world.r_crash, live(d_obs, d_goal, world))  # (W, T)
-    turn = np.abs(np.angle(to_goal * np.exp(-1j * headings)))  # (W, T) rad
-    rest = np.where(arrived, 0, turn / world.yaw_rate + d_goal / world.speed)  # (W, T) s
-    more = gamma ** (1 + rest / world.dt) * (world.r_safe + 1) / (1 - gamma)  # (W, T)
-    r = r + np.where((k == last) & ~lost, more, 0)  # (W, T)
+    r = r + forward_reward * world.speed * world.dt * np.cos(headings)  # (W, T)
+    to_goal, to_far = (
+        steps_to(way, headings, world) for way in (world.length - at, world.length - x)
+    )
+    flying = np.maximum(goal_value * gamma**to_goal, far_value * gamma**to_far)  # (W, T)
+    prize = np.select([crash, arrived, far, side], [0, goal_value, far_value, 0], flying)  # (W, T)
+    r = r + np.where(k == last, gamma * prize, 0)  # (W, T)
     worth = (gamma**k * r * (k <= last)).sum(1)  # (W,)
     return worth.reshape(world.actions, -1).max(1)
+
+
+def steps_to(way: ndarray, headings: ndarray, world: World) -> ndarray:
+    """How many control steps it takes to turn from the headings to these ways, x + iy in m, and to
+    fly along them: all (W, T)."""
+    turn = np.abs(np.angle(way * np.exp(-1j * headings)))  # (W, T) rad
+    return (turn / world.yaw_rate + np.abs(way) / world.speed) / world.dt  # (W, T)
 
 
 @cache

@@ -27,7 +27,7 @@ from deepflight import (
     wilson,
 )
 from dqn import DQNConfig, QNetwork, load, load_weights, save, save_weights
-from env import OUTCOMES, Fleet, World, refly
+from env import OUTCOMES, Fleet, World, fly, refly, straight_pilot
 
 ROOT = Path(__file__).parent.parent
 WORLD = World()
@@ -122,7 +122,7 @@ def test_the_help_says_what_is_allowed_and_what_a_preset_changes(
         assert stop.value.code == 0
     text = capsys.readouterr().out
     assert "control steps in all (1 to 1e+09; default 200000; mnih 1400000; beacon 400000)" in text
-    assert "(-1e+06 to 1e+06; default 200.0; dqn 0.0; mnih 0.0; beacon 50.0)" in text
+    assert "(-1e+06 to 1e+06; default 200.0; dqn 0.0; mnih 0.0; teacher 125.0; beacon 50.0)" in text
     assert "(true or false; default True; dqn False; mnih False)" in text
     assert "default: 2000000000" in text
 
@@ -133,14 +133,14 @@ def test_every_piece_that_is_not_in_the_textbook_has_one_setting_that_switches_i
     source = "".join((ROOT / name).read_text() for name in ("deepflight.py", "dqn.py"))
     for name in extras:
         assert f"[+{name}]" in source, f"{name} is marked where it happens"
-    off = DQN | dict(adam=False, num_envs=1, bfloat16=False)
+    off = DQN | dict(adam=False, num_envs=1, bfloat16=False, teacher=False)
     assert extras.keys() == off.keys()
     configure(off)  # all of them at once are a legal training: plain DQN
 
 
-def test_there_are_26_settings_and_each_is_a_flag(capsys: pytest.CaptureFixture) -> None:
+def test_there_are_31_settings_and_each_is_a_flag(capsys: pytest.CaptureFixture) -> None:
     settings = [f.name for f in deepflight.SETTINGS]
-    assert len(settings) == len({*settings}) == 26
+    assert len(settings) == len({*settings}) == 31
     with pytest.raises(SystemExit):
         deepflight.parse(["train", "--help"])
     text = capsys.readouterr().out
@@ -228,6 +228,27 @@ train --name LONG
 train --seed -1
 train --seed 1.5
 train --colour red
+train --demos nowhere.json
+train --demos .
+train --demos pipe
+train --demos /dev/zero
+train --demos text.pt
+train --demos demos/list.json
+train --demos demos/empty.json
+train --demos demos/digit.json
+train --demos demos/ended.json
+train --demos demos/short.json
+train --demos demos/late.json
+train --demos demos/test.json
+train --demos demos/none.json
+train --demos demos/types.json
+train --demos demos/good.json --beacon
+train --demos EMPTY
+train --no-bellman
+train --demo-updates 0
+train --demo-share 1.5
+train --margin -1
+train --resume runs/taken --demos demos/good.json
 train now
 train --resume nowhere
 train --resume runs/taken --name other
@@ -285,6 +306,23 @@ fly
 """
 
 
+def write_demos(folder: Path) -> None:
+    """A good file of demonstrations, and others with one thing wrong."""
+    folder.mkdir()
+    good = fly(straight_pilot, [0, 1], WORLD, camera=False)
+    files = {"good": good, "none": [], "short": [good[0] | {"actions": good[0]["actions"][:-1]}]}
+    files["digit"] = [good[0] | {"actions": "9" + good[0]["actions"][1:]}]
+    files["late"] = [good[0] | {"actions": good[0]["actions"] + "4"}]
+    files["ended"] = [good[0], good[1] | {"outcome": "goal"}]
+    files["test"] = fly(straight_pilot, [deepflight.TESTS[0]], WORLD, camera=False)
+    files["types"] = [good[0] | {"actions": [4] * good[0]["steps"]}]
+    for name, flights in files.items():
+        report = {"beacon": False, "pilots": {"straight": {"flights": flights}}}
+        (folder / f"{name}.json").write_text(json.dumps(report))
+    (folder / "list.json").write_text("[]")
+    (folder / "empty.json").write_text("")
+
+
 def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -302,6 +340,7 @@ def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
     (tmp_path / "diary").write_text("my diary on Deep Flight")
     (tmp_path / "link").symlink_to(tmp_path / "text.pt")
     os.mkfifo(tmp_path / "pipe")
+    write_demos(tmp_path / "demos")
     network = {name: x.half() for name, x in QNetwork(9).state_dict().items()}
     save(tmp_path / "bare.pt", "weights", {"network": network})
     network["head.2.bias"] = network["head.2.bias"] * torch.nan

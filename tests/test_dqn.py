@@ -21,7 +21,7 @@ from torch.optim.optimizer import (
 )
 
 import deepflight
-from deepflight import RunConfig, train
+from deepflight import RunConfig, draw, train
 from dqn import (
     LIVE,
     TERMINAL,
@@ -39,10 +39,12 @@ from dqn import (
     load,
     load_weights,
     lock_folder,
+    margin_loss,
     mirror,
     save,
     save_weights,
     td_target,
+    teacher_loss,
     whole_file,
 )
 from env import World
@@ -238,7 +240,9 @@ def test_mirroring_reflects_whole_transitions_and_half_of_them() -> None:
     s, s2 = rng.integers(256, size=(2, 64, 4, 84, 84), dtype=np.uint8)
     a, r, discount = np.arange(64) % 9, rng.normal(size=64), rng.random(64)
     end = rng.integers(3, size=64)
-    batch = mirror(Batch(s.copy(), a.copy(), r.copy(), s2.copy(), discount, end), 9, rng)
+    scores, shown = rng.normal(size=(64, 9)), rng.random(64) < 0.5
+    copies = s.copy(), a.copy(), r.copy(), s2.copy(), discount, end, scores.copy(), shown
+    batch = mirror(Batch(*copies), 9, rng)
     flipped = np.array([(x == y[..., ::-1]).all() for x, y in zip(batch.s, s, strict=True)])
     assert 20 <= flipped.sum() <= 44  # three standard deviations
     turned = flipped[:, None, None, None]
@@ -250,15 +254,75 @@ def test_mirroring_reflects_whole_transitions_and_half_of_them() -> None:
     assert (batch.r == r).all()
     assert (batch.gamma_n == discount).all()
     assert (batch.end == end).all()
+    assert (batch.scores == np.where(flipped[:, None], scores[:, ::-1], scores)).all()
+    assert (batch.shown == shown).all()
 
 
 def test_other_draws_reflect_other_transitions() -> None:
-    pictures, zeros = np.zeros((64, 4, 84, 84), np.uint8), np.zeros(64)
+    pictures, zeros, none = np.zeros((64, 4, 84, 84), np.uint8), np.zeros(64), np.zeros((64, 0))
     rng, drawn = np.random.default_rng(0), set()
     for _ in range(5):
         a = np.zeros(64, int)
-        drawn.add(tuple(mirror(Batch(pictures, a, zeros, pictures, zeros, zeros), 9, rng).a))
+        batch = Batch(pictures, a, zeros, pictures, zeros, zeros, none, zeros)
+        drawn.add(tuple(mirror(batch, 9, rng).a))
     assert len(drawn) == 5
+
+
+# -------------------------------------------------- what others say
+
+
+def test_the_margin_loss_is_how_far_the_shown_action_is_from_the_best_by_the_margin() -> None:
+    rng = np.random.default_rng(0)
+    q, a = rng.normal(0, 5, (500, 9)), rng.integers(9, size=500)
+    missed = []
+    for values, shown in zip(q, a, strict=True):
+        others = max(x for i, x in enumerate(values) if i != shown)
+        missed.append(max(others + 3.0 - values[shown], 0))
+    loss = margin_loss(torch.from_numpy(q), torch.from_numpy(a), 3.0)
+    assert loss.numpy() == pytest.approx(missed)
+    assert 0 < np.count_nonzero(missed) < 500
+
+
+def test_a_teacher_moves_differences_of_values_to_those_of_its_scores_and_not_their_level() -> None:
+    scores = torch.tensor([[3.0, 1.0, -500.0], [70.0, 70.0, 70.0]])
+    q = torch.tensor([[10.0, 20.0, 60.0], [5.0, -5.0, 0.0]], requires_grad=True)
+    optimizer, level = torch.optim.SGD([q], 5.0), q.mean(1).tolist()
+    for _ in range(300):
+        optimizer.zero_grad()
+        teacher_loss(q, scores).backward()
+        optimizer.step()
+    assert q.mean(1).tolist() == pytest.approx(level, abs=1e-4)
+    assert (q[0] - q[0, 0]).tolist() == pytest.approx([0, -2, -20], abs=1e-3)  # 20 at most
+    assert (q[1] - q[1, 0]).tolist() == pytest.approx([0, 0, 0], abs=1e-3)
+
+
+def test_what_the_teacher_said_comes_back_with_its_state() -> None:
+    replay, rng = Replay(40, 2, 9), np.random.default_rng(0)
+    scores, nothing = rng.normal(size=(30, 2, 9)).astype(np.float32), np.zeros(2, bool)
+    for t in range(30):
+        s = np.stack([np.stack([picture(1 + t)] * 4)] * 2)
+        replay.add(s, np.zeros(2), np.zeros(2), s, nothing, nothing, scores[t])
+    batch = replay.sample(200, 5, 0.9, rng)
+    told = scores[number(batch.s)[:, 3] - 1]  # (B, 2, 9) of both lanes
+    assert (batch.scores[:, None] == told).all(2).any(1).all()
+    assert not batch.shown.any()
+
+
+def test_a_quarter_of_each_batch_is_demonstrated_and_at_first_all_of_it() -> None:
+    own, lesson = Replay(40, 1), Replay(40, 1, shown=True)
+    for replay, value in ((own, 1.0), (lesson, 2.0)):
+        for _ in range(30):
+            state, none = np.zeros((1, 4, 84, 84), np.uint8), np.zeros(1, bool)
+            replay.add(state, np.zeros(1), np.full(1, value), state, none, none)
+    c, rng = DQNConfig(n_steps=1), np.random.default_rng(0)
+    for batch, shown in (
+        (draw(own, None, c, rng), 0),
+        (draw(own, lesson, c, rng), 8),
+        (draw(lesson, None, c, rng), 32),
+    ):
+        assert len(batch.r) == 32
+        assert batch.shown.sum() == (batch.r == 2).sum() == shown
+        assert (batch.shown == (batch.r == 2)).all()
 
 
 # -------------------------------------------------- the network and the agent

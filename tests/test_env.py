@@ -413,10 +413,18 @@ GAMMA = 0.99
 
 def best(env: ForestEnv) -> int:
     """What the planner takes where this drone is."""
-    return int(plan(*env.scan(), env.pose, env.world, GAMMA).argmax())
+    return int(plan(*env.scan(), env.pose, env.world, GAMMA, 0.0, 125.0, 0.0).argmax())
 
 
-def read_forwards(scan: Sequence, pose: Sequence, w: World, gamma: float) -> list[float]:
+def read_forwards(
+    scan: Sequence,
+    pose: Sequence,
+    w: World,
+    gamma: float,
+    forward: float,
+    goal: float,
+    far_end: float,
+) -> list[float]:
     """What `plan` should say, one way and one step after another."""
     bark = [(d * math.cos(b), d * math.sin(b)) for b, d in zip(*scan, strict=True)]
     bark = [point for point, d in zip(bark, scan[1], strict=True) if d < w.laser_range]
@@ -434,15 +442,22 @@ def read_forwards(scan: Sequence, pose: Sequence, w: World, gamma: float) -> lis
             d_obs = min([math.dist((ahead, left), point) for point in bark] + [w.laser_range])
             d_goal, crash = math.dist((px, py), (w.length, 0)), d_obs < w.d_crash + 0.1
             arrived = not crash and d_goal < w.goal_radius
-            out = not -w.back <= px <= w.length or abs(py) > w.width / 2
-            lost = crash or (out and not arrived)
+            far = not crash and not arrived and px > w.length
+            out = not arrived and (px < -w.back or abs(py) > w.width / 2)
+            lost = crash or far or out
             worth += gamma**k * reward("crash" if lost else "", d_obs, d_goal, w)
+            worth += gamma**k * forward * w.speed * w.dt * math.cos(heading + turned)
             if lost or arrived:
                 break
-        turn = math.remainder(math.atan2(-py, w.length - px) - heading - turned, math.tau)
-        rest = 0 if arrived else (abs(turn) / w.yaw_rate + d_goal / w.speed) / w.dt  # steps
-        more = gamma ** (k + 1 + rest) * (w.r_safe + 1) / (1 - gamma)
-        worths[first].append(worth + (0 if lost else more))
+        ends = []
+        for bearing, metres, value in (
+            (math.atan2(-py, w.length - px), d_goal, goal),
+            (0.0, w.length - px, far_end),
+        ):
+            turn = abs(math.remainder(bearing - heading - turned, math.tau))
+            ends.append(value * gamma ** ((turn / w.yaw_rate + metres / w.speed) / w.dt))
+        more = goal if arrived else far_end if far else 0 if lost else max(ends)
+        worths[first].append(worth + gamma ** (k + 1) * more)
     return [max(some) for some in worths]
 
 
@@ -461,8 +476,8 @@ def test_the_planner_adds_up_the_rewards_to_come_in_any_world(seed: int) -> None
     for _ in range(5):
         x, y = rng.random(2) * (world.length, world.width) - (0, world.width / 2)
         env.pose = (x, y, rng.uniform(-4, 4))
-        expected = read_forwards(env.scan(), env.pose, world, gamma)
-        assert plan(*env.scan(), env.pose, world, gamma) == pytest.approx(expected)
+        told = env.pose, world, gamma, *rng.uniform(0, 3, 1), *rng.uniform(0, 200, 2)
+        assert plan(*env.scan(), *told) == pytest.approx(read_forwards(env.scan(), *told))
 
 
 def test_in_the_open_the_planner_turns_to_the_goal() -> None:

@@ -20,7 +20,7 @@ import threading
 import time
 import warnings
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -35,7 +35,7 @@ import torch
 import deepflight
 from deepflight import configure, train
 from dqn import QNetwork, Replay, load, load_weights, lock_folder, save, save_weights
-from env import Fleet, ForestEnv, World
+from env import Fleet, ForestEnv, World, fly, laser_pilot
 
 CHECKPOINT = "checkpoint.pt"
 ROOT = Path(__file__).parent.parent
@@ -83,12 +83,14 @@ class Watched(deepflight.Run):
         self.runs.append(self)
 
 
-def train_with_cuts(folder: Path, cuts: set[int], **changed: object) -> deepflight.Run:
+def train_with_cuts(
+    folder: Path, cuts: set[int], demos: Sequence = (), **changed: object
+) -> deepflight.Run:
     """Train SMALL in this folder, taken up again after every cut; returns the last run."""
     Watched.cuts, saved = cuts, None
     c, r = configure(SMALL | changed)
     for _ in range(len(cuts) + 1):
-        train(c, r, folder, saved)
+        train(c, r, folder, saved, demos)
         saved = load(folder / CHECKPOINT, "checkpoint")
     return Watched.runs[-1]
 
@@ -154,6 +156,18 @@ def test_ten_times_taken_up_again_is_never_interrupted(tmp_path: Path, watched: 
     assert_same_training(tmp_path / "whole", tmp_path / "cut")
     for name in ("frames", "actions", "rewards", "ends", "added"):
         assert np.array_equal(getattr(whole.replay, name), getattr(cut.replay, name)), name
+
+
+def test_with_a_teacher_and_demonstrations_too(tmp_path: Path, watched: None) -> None:
+    flights = fly(laser_pilot(0.99), [0, 1], World(), camera=False)
+    demos = [(f["seed"], f["actions"]) for f in flights]
+    told = {"teacher": True, "demo_updates": 3, "steps": 480, "test_every": 160}
+    whole = train_with_cuts(tmp_path / "whole", set(), demos, **told)
+    cut = train_with_cuts(tmp_path / "cut", {8, 200, 408}, demos, **told)
+    assert_same_training(tmp_path / "whole", tmp_path / "cut")
+    assert np.array_equal(whole.replay.scores, cut.replay.scores)
+    assert whole.replay.scores.any(2).all()
+    assert load(tmp_path / "cut" / CHECKPOINT, "checkpoint")["demos"] == demos
 
 
 def test_a_truncated_flight_comes_back_with_its_last_frame(

@@ -12,6 +12,7 @@ import csv
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import matplotlib
@@ -20,8 +21,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from deepflight import Parser, place
-from dqn import check_output
+from deepflight import Parser, RunConfig, place
+from dqn import DQNConfig, check_output
 
 ROOT = Path(__file__).parents[2]
 FREE = ("seed", "threads", "test_every")  # settings that may differ
@@ -34,8 +35,9 @@ POINTS = 5  # test points in a mean
 
 
 def settings(folder: Path) -> dict[str, object]:
-    """A training's settings, without those that may differ."""
-    found = json.loads((folder / "config.json").read_text())
+    """A training's settings, without those that may differ; a setting that it lacks is as today."""
+    found = asdict(DQNConfig()) | asdict(RunConfig())
+    found |= json.loads((folder / "config.json").read_text())
     return {key: value for key, value in found.items() if key not in FREE}
 
 

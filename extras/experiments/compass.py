@@ -23,7 +23,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from deepflight import EVAL_FIRST, TRAIN_END
+from deepflight import EVAL_FIRST, TRAIN_END, RunConfig
 from dqn import DQNConfig, QNetwork, linear_schedule
 from env import STACK, Fleet, World, fly, measure, plan, plant
 from render import camera
@@ -91,7 +91,9 @@ def crossed(fold: int) -> float:
         for env in fleet.flying:
             heading = np.angle(np.exp(1j * fold * env.pose[2])) / max(fold, 1)  # rad
             pose = (WORLD.length / 2, 0.0, heading)
-            actions.append(int(plan(*env.scan(), pose, WORLD, DQNConfig.gamma).argmax()))
+            paid = DQNConfig.gamma, 0.0, RunConfig.goal_value, 0.0
+            worth = plan(*env.scan(), pose, WORLD, *paid)
+            actions.append(int(worth.argmax()))
         return actions
 
     flights = fly(pilot, range(EVAL_FIRST, EVAL_FIRST + FLIGHTS), WORLD, camera=False)

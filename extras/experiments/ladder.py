@@ -100,17 +100,21 @@ def trainings() -> Iterator[tuple[str, str, int, list[str]]]:
 
 
 def train(training: tuple[str, str, int, list[str]]) -> None:
-    """Train, or go on where an interrupted training stands, or do nothing if it is done."""
+    """Do a training of the ladder unless it has been flown."""
     name, label, seed, flags = training
+    if str(seed) not in flown().get(label, {}):
+        go_on(name, seed, flags)
+
+
+def go_on(name: str, seed: int, flags: list[str]) -> None:
+    """Train, or go on where an interrupted training stands, or do nothing if it is done."""
     folder = ROOT / "runs" / name
-    if str(seed) in flown().get(label, {}):
-        return
     words = ["--name", name, "--threads", "1", "--seed", str(seed), *flags]
     if finished(folder):
         return
     if (folder / "checkpoint.pt").exists():
         words = ["--resume", str(folder)]
-    print(f"{name}: {label}", flush=True)
+    print(name, flush=True)
     line = [sys.executable, str(ROOT / "deepflight.py"), "train", *words]
     subprocess.run(line, cwd=ROOT, stdout=subprocess.DEVNULL, check=True)
 
