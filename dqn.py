@@ -54,7 +54,7 @@ The truth moves backwards through the flight. Three things can go wrong. DQN has
     with probability epsilon it takes a random action, at first always, later rarely.
 
 Algorithm 1 of [Mnih15], "Human-level control through deep reinforcement learning", Nature 518. The
-code carries these numbers. `train` in deepflight.py has all of them on one screen.
+code carries these numbers. `train` in deepflight.py and what it calls have all of them.
 
      1  initialize replay memory D to capacity N
      2  initialize action-value function Q with random weights theta
@@ -86,6 +86,8 @@ the mean of (y - Q)^2. Its gradient says for every weight which way the loss gro
     optimizer.zero_grad()   forget the last gradient
     loss.backward()    compute the gradient, and leave it with the weights
     optimizer.step()   move the weights a little against the gradient
+    smooth_l1_loss(q, y, beta=10)   with e = q - y, the mean of e^2 / 20 up to an error of 10, and
+                       of abs(e) - 5 beyond: a square that goes on as a straight line
     values.gather(1, a[:, None])[:, 0]      in NumPy: values[arange(len(a)), a]
     nn.Module          a function that owns weights; state_dict() gives them all, by name
     nn.Sequential(f, g)     g(f(x))
@@ -93,11 +95,12 @@ the mean of (y - Q)^2. Its gradient says for every weight which way the loss gro
     x.sqrt_()          a name with _ at its end changes x itself
 
 A mark like [+double] means: not in the textbook. `double` is then a setting, and its text says how
-to switch it off. One update in four steps is Mnih's too, although Algorithm 1 has one a step.
-[Mnih15] limits line 14, and we count that as textbook: up to an error of 1 the loss is half the
-error's square, and beyond it a straight line. So a large error changes the weights no more than an
-error of 1. (Our limit is 10 [+huber].) [Mnih15] also cuts rewards to [-1, 1]. We do not, because a
-crash would then count no more than being near a trunk.
+to switch it off. ([+demos] is a flag of `train`, without which it is off.) One update in four steps
+is Mnih's too, although Algorithm 1 has one a step. [Mnih15] limits line 14, and we count that as
+textbook: up to an error of 1 the loss is half the error's square, and beyond it a straight line. So
+a large error changes the weights no more than an error of 1. (Our limit is 10 [+huber].) [Mnih15]
+also cuts rewards to [-1, 1]. We do not, because a crash would then count no more than being near a
+trunk.
 
 Legend
     s, a      state and action
@@ -170,8 +173,10 @@ class DQNConfig:
     huber: float = setting(10.0, "[+] delta: larger errors pull no harder; 1: Mnih's", 1e-3, 1e6)
     lr_decay: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
     average: float = setting(0.1, "[+] last share of the steps, averaged to fly; 0: off", 0, 0.5)
-    teacher: bool = setting(False, "[+] a planner says what each action is worth", 0, 1)
-    bellman: bool = setting(True, "learn from rewards; --no-bellman: from others alone", 0, 1)
+    teacher: bool = setting(
+        False, "[+] a planner says what actions are worth; off by default", 0, 1
+    )
+    bellman: bool = setting(True, "TD targets; --no-bellman: from the teacher alone", 0, 1)
     demo_updates: int = setting(2_000, "updates on --demos alone, before all others", 1)
     demo_share: float = setting(0.25, "share of --demos in every later batch", 0, 1)
     margin: float = setting(5.0, "by which a demonstrated action must be the best", 0, 1e3)
@@ -252,9 +257,9 @@ def margin_loss(q: Tensor, a: Tensor, margin: float) -> Tensor:
 
 
 def teacher_loss(q: Tensor, scores: Tensor) -> Tensor:
-    """[+teacher] How far the values q (B, A) are from a teacher's scores (B, A), in all but their
-    level: the teacher says by how much one action is better than another, and rewards say how good
-    the state is. An action that is 20 worse than the best or more counts as 20 worse.
+    """[+teacher] How far q (B, A) is from a teacher's scores (B, A), after each state's mean has
+    been taken from both. So the teacher says by how much an action is better than another, and not
+    how good the state is. An action that is 20 worse than the best or more counts as 20 worse.
     """
     scores = (scores - scores.amax(1, keepdim=True)).clamp(-20)  # (B, A) 0 for the best
     q, scores = (x - x.mean(1, keepdim=True) for x in (q, scores))  # (B, A), (B, A)
@@ -291,10 +296,11 @@ class Replay:
     picture of s_t of drone l, the action taken there, its reward and how it ended. The rows are a
     ring: when the last one is written, the first is written again.
 
-        lane 0   x x x|x x x x x x x x     |: a flight's end, which no stack and no n-step
-        lane 1   x x x x x|x x x x x x        window crosses
-                           W               W: the row written next, which no window crosses
+        lane 0   x x x|x x x x x x x x     |: a flight's end
+        lane 1   x x x x x|x x x x x x     W: the row that is written next
+                           W
 
+    A state's four pictures and a label's n rewards never reach across a flight's end, nor across W.
     The s2 of a transition is the state of the next row. After a crash no s2 is needed. After the
     time limit it is needed and no row holds it, so `last_frames` keeps its newest picture. An
     example with one lane:
@@ -308,7 +314,8 @@ class Replay:
         window of row 3, n = 2: r = 0 + gamma * 0, and s2 is the stack of row 5
     """
 
-    def __init__(self, capacity: int, lanes: int, scores: int = 0, shown: bool = False) -> None:
+    def __init__(self, capacity: int, lanes: int, told: int = 0, shown: bool = False) -> None:
+        """told: how many numbers a teacher says of a state. shown: are these demonstrations?"""
         shape = (capacity // lanes, lanes)
         try:
             self.frames = np.empty((*shape, 84, 84), np.uint8)  # (T, L, 84, 84)
@@ -317,7 +324,7 @@ class Replay:
         self.actions = np.zeros(shape, np.uint8)  # (T, L)
         self.rewards = np.zeros(shape, np.float32)  # (T, L)
         self.ends = np.zeros(shape, np.uint8)  # (T, L)
-        self.scores, self.shown = np.zeros((*shape, scores), np.float32), shown  # (T, L, A or 0)
+        self.scores, self.shown = np.zeros((*shape, told), np.float32), shown  # (T, L, A or 0)
         self.last_frames: dict[tuple[int, int], ndarray] = {}  # (row, lane) -> (84, 84)
         self.rows, self.lanes = shape
         self.added = 0  # rows ever written
@@ -358,8 +365,8 @@ class Replay:
         taken in s_1. If that was not the best one, the label is too low. We accept that, because it
         learns sooner. A window stops at the end of a flight.
         """
-        # In the example, row 1, n = 3: k = 0 gives r = 1. k = 1 adds 0.99 * -10, and there the
-        # flight ends. So k = 2 adds nothing, and gamma_n stays 0.99^2.
+        # In the class's example, row 1, n = 3: k = 0 gives r = 1. k = 1 adds 0.99 * -10, and there
+        # the flight ends. So k = 2 adds nothing, and gamma_n stays 0.99^2.
         r, gamma_n = np.zeros(len(row), np.float32), np.ones(len(row), np.float32)  # (B,), (B,)
         last, live = row, np.ones(len(row), bool)  # (B,), (B,) newest row in r; is more to come?
         for k in range(n):
@@ -372,7 +379,7 @@ class Replay:
         # s2 is the state of the row after the last one, if the flight goes on there.
         after = np.where(end == LIVE, (last + 1) % self.rows, last)  # (B,)
         s2 = self.stack(after, lane)  # (B, 4, 84, 84)
-        for i in np.flatnonzero(end == TRUNCATED):  # the last row's state, and one more picture
+        for i in np.flatnonzero(end == TRUNCATED):  # s2 is the last row's state: add a picture
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], lane[i]]]
         a = self.actions[row, lane].astype(np.int64)  # (B,)
         scores, shown = self.scores[row, lane], np.full(len(row), self.shown)  # (B, A), (B,)

@@ -354,15 +354,15 @@ class Fleet:
         return s2, r, terminated, truncated, [env.info() for env in envs]
 
     def record(self, steps: int) -> list[Record]:
-        """Of each lane, the flights that its last steps belong to, as seeds and actions. A
-        checkpoint keeps these."""
+        """Of each lane, the flights that its last steps belong to, as seeds and actions. The file
+        of an unfinished training keeps these."""
         for flights in self.records:
             while sum(len(actions) for _, actions in flights[1:]) >= steps:
                 flights.pop(0)
         return [[(seed, "".join(map(str, a))) for seed, a in lane] for lane in self.records]
 
 
-# -------------------------------------------------- pilots without a network, many flights: skim
+# -------------------------------------------------- pilots without a network, many flights
 
 Pilot = Callable[[Fleet], Sequence[int]]  # an action for each drone in the air
 Flights = list[dict[str, Any]]  # of ForestEnv.flight
@@ -405,12 +405,12 @@ def plan(
 
     It adds up the rewards to come. A way is one of the yaw rates for 0.6 s, then one for 1.6 s: W =
     A * A ways of T steps. It ends early where it crashes, leaves or arrives. The reward of step k
-    counts gamma^k times. A way that is not over is worth more than its rewards: as if the drone
-    turned to the goal, flew straight to it without reward, and arrived there; or so to the far
-    edge, if that is worth more. A yaw rate is worth what the best way is worth that begins with it.
-    In numbers, where arrival is worth 125 and nothing else is paid: straight on from the start, far
-    from trunks. 22 steps earn 6.2. The goal is then 79 m or 158 steps away, so 0.99^(22 + 158) *
-    125 = 20.5 more: 26.7.
+    counts gamma^k times. Where a way does not end early, more is to come. So we add goal_value
+    times gamma^n, as if the drone turned to the goal and flew straight to it in n steps, through
+    all trunks and without reward. Or far_value, in the same manner, if that is more. A yaw rate is
+    worth what the best way is worth that begins with it. In numbers, where arrival is worth 125 and
+    nothing else is paid: straight on from the start, far from trunks. 22 steps earn 6.2. The goal
+    is then 79 m or 158 steps away, so 0.99^(22 + 158) * 125 = 20.5 more: 26.7.
     """
     # A place is the complex number x + iy, in m. A product with exp(i psi) turns it left by psi.
     (ahead, turned), here, heading = ways(world), complex(*pose[:2]), pose[2]
@@ -419,7 +419,7 @@ def plan(
     bark = beams[distances < world.laser_range][:, None, None]  # (P, 1, 1)
     d_obs = np.abs(at - bark).min(0, initial=np.inf)  # (W, T) m
     d_goal, x, y = np.abs(world.length - at), at.real, np.abs(at.imag)  # (W, T) m each
-    # 0.1 m to spare: the scan shows the near sides of trunks only, and points 0.1 m apart there.
+    # 0.1 m to spare: the scan shows single points of the bark, on the near side only.
     crash, arrived = d_obs < world.d_crash + 0.1, d_goal < world.goal_radius  # (W, T), (W, T)
     far, side = x > world.length, (x < -world.back) | (y > world.width / 2)  # (W, T), (W, T)
     over, k = crash | arrived | far | side, np.arange(at.shape[1])  # (W, T), (T,)
@@ -428,21 +428,25 @@ def plan(
     lost = crash | ((far | side) & ~arrived)  # (W, T)
     r = np.where(lost, world.r_crash, live(d_obs, d_goal, world))  # (W, T)
     r = r + forward_reward * world.speed * world.dt * np.cos(headings)  # (W, T)
-    to_goal, to_far = (
-        steps_to(way, headings, world) for way in (world.length - at, world.length - x)
-    )
-    flying = np.maximum(goal_value * gamma**to_goal, far_value * gamma**to_far)  # (W, T)
-    prize = np.select([crash, arrived, far, side], [0, goal_value, far_value, 0], flying)  # (W, T)
+    # What comes after the last step: if it is over its prize, else the way to one.
+    rest = prize_ahead(at, headings, world, gamma, goal_value, far_value)  # (W, T)
+    prize = np.select([crash, arrived, far, side], [0, goal_value, far_value, 0], rest)  # (W, T)
     r = r + np.where(k == last, gamma * prize, 0)  # (W, T)
     worth = (gamma**k * r * (k <= last)).sum(1)  # (W,)
     return worth.reshape(world.actions, -1).max(1)
 
 
-def steps_to(way: ndarray, headings: ndarray, world: World) -> ndarray:
-    """How many control steps it takes to turn from the headings to these ways, x + iy in m, and to
-    fly along them: all (W, T)."""
-    turn = np.abs(np.angle(way * np.exp(-1j * headings)))  # (W, T) rad
-    return (turn / world.yaw_rate + np.abs(way) / world.speed) / world.dt  # (W, T)
+def prize_ahead(
+    at: ndarray, headings: ndarray, world: World, gamma: float, goal_value: float, far_value: float
+) -> ndarray:
+    """What the better prize is worth to drones at these places, x + iy in m, with these headings,
+    if they turn to it and fly straight there: all (W, T)."""
+    worths = []
+    for way, value in ((world.length - at, goal_value), (world.length - at.real, far_value)):
+        turn = np.abs(np.angle(way * np.exp(-1j * headings)))  # (W, T) rad
+        steps = (turn / world.yaw_rate + np.abs(way) / world.speed) / world.dt  # (W, T)
+        worths.append(value * gamma**steps)  # (W, T)
+    return np.maximum(*worths)
 
 
 @cache

@@ -27,7 +27,7 @@ from deepflight import (
     wilson,
 )
 from dqn import DQNConfig, QNetwork, load, load_weights, save, save_weights
-from env import OUTCOMES, Fleet, World, fly, refly, straight_pilot
+from env import OUTCOMES, Fleet, World, fly, laser_pilot, refly, straight_pilot
 
 ROOT = Path(__file__).parent.parent
 WORLD = World()
@@ -122,7 +122,7 @@ def test_the_help_says_what_is_allowed_and_what_a_preset_changes(
         assert stop.value.code == 0
     text = capsys.readouterr().out
     assert "control steps in all (1 to 1e+09; default 200000; mnih 1400000; beacon 400000)" in text
-    assert "(-1e+06 to 1e+06; default 200.0; dqn 0.0; mnih 0.0; teacher 125.0; beacon 50.0)" in text
+    assert "(-1e+06 to 1e+06; default 200.0; dqn 0.0; mnih 0.0; teacher 115.0; beacon 50.0)" in text
     assert "(true or false; default True; dqn False; mnih False)" in text
     assert "default: 2000000000" in text
 
@@ -241,6 +241,10 @@ train --demos demos/short.json
 train --demos demos/late.json
 train --demos demos/test.json
 train --demos demos/none.json
+train --demos demos/other.json
+train --demos demos/return.json
+train --demos demos/nan.json
+train --demos LONG
 train --demos demos/types.json
 train --demos demos/good.json --beacon
 train --demos EMPTY
@@ -312,6 +316,11 @@ def write_demos(folder: Path) -> None:
     good = fly(straight_pilot, [0, 1], WORLD, camera=False)
     files = {"good": good, "none": [], "short": [good[0] | {"actions": good[0]["actions"][:-1]}]}
     files["digit"] = [good[0] | {"actions": "9" + good[0]["actions"][1:]}]
+    arrived = fly(laser_pilot(0.99), [0], WORLD, camera=False)[0]
+    files["other"] = [arrived | {"actions": arrived["actions"][:-1] + "0"}]
+    assert arrived["actions"][-1] != "0"
+    files["return"] = [arrived | {"return": arrived["return"] + 1}]
+    files["nan"] = [arrived | {"return": math.nan}]
     files["late"] = [good[0] | {"actions": good[0]["actions"] + "4"}]
     files["ended"] = [good[0], good[1] | {"outcome": "goal"}]
     files["test"] = fly(straight_pilot, [deepflight.TESTS[0]], WORLD, camera=False)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import deepflight
+from dqn import DQNConfig
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -48,14 +49,17 @@ def test_the_front_page_is_one_page() -> None:
 @pytest.mark.parametrize("figure", FIGURES)
 def test_each_row_of_the_headline_table_is_what_eval_wrote(figure: str) -> None:
     label, factor, digits = FIGURES[figure]
-    row = f"| {label} |"
-    for name, pilot in (("paper", "dqn"), ("beacon", "dqn"), ("pilots", "laser")):
-        row += f" {shown(report(name)['pilots'][pilot][figure], factor, digits)} |"
-    assert row in README
-    assert row in RESULTS
+
+    def row(*columns: tuple[str, str]) -> str:
+        figures = [report(name)["pilots"][pilot][figure] for name, pilot in columns]
+        return " | ".join(["", label, *(shown(x, factor, digits) for x in figures), ""]).strip()
+
+    scratch, taught = ("scratch", "dqn"), (("paper", "dqn"), ("beacon", "dqn"))
+    assert row(scratch, *taught) in README
+    assert row(scratch, ("beacon-scratch", "dqn"), *taught, ("pilots", "laser")) in RESULTS
 
 
-@pytest.mark.parametrize("name", ["paper", "beacon", "pilots"])
+@pytest.mark.parametrize("name", ["paper", "beacon", "scratch", "beacon-scratch", "pilots"])
 def test_headline_numbers_come_from_forests_that_no_training_has_seen(name: str) -> None:
     assert (report(name)["forests"], report(name)["first_seed"]) == (1000, 3 * 10**9)
 
@@ -143,15 +147,19 @@ def test_the_atlas_says_what_the_pages_say() -> None:
 def test_the_clock_on_the_pages_is_the_measured_one() -> None:
     clock = report("clock")
     steps = max(seed["step"] for seed in clock["seeds"].values())
-    assert f"After {steps:,} steps, or {clock['median']:.0f} seconds, it flies over" in FLAT
+    assert f"After {steps:,} of its" in FLAT
+    assert f"or {clock['median']:.0f} seconds, it flies over" in FLAT
     assert f"after {clock['median']:.0f} s and at most {steps:,} steps" in LONG
 
 
 def test_the_minutes_of_a_training_are_those_of_its_log() -> None:
-    last = (ROOT / "results/paper/log.csv").read_text().splitlines()[-1].split(",")
-    minutes = float(last[-1]) / 60
-    assert f"The first line flies {int(last[0]):,} steps." in FLAT
-    assert f"The shipped pilot took {minutes:.0f} minutes" in FLAT
+    for name, said in (
+        ("paper", "With `--threads 1` it made the shipped pilot in {} minutes."),
+        ("beacon", "It took {} minutes for 400,000 steps"),
+    ):
+        *_, seconds = (ROOT / f"results/{name}/log.csv").read_text().splitlines()[-1].split(",")
+        assert said.format(round(float(seconds) / 60)) in FLAT + LONG
+    assert f"10,000 of its {DQNConfig.steps:,} steps" in FLAT
 
 
 def test_the_flights_at_three_control_rates_are_what_was_measured() -> None:
@@ -174,6 +182,17 @@ def test_each_training_of_the_ladder_is_on_the_long_page() -> None:
 
     for label, seeds in report("ladder").items():
         cells = [cell(seeds[seed]) if seed in seeds else "" for seed in "012"]
+        assert " ".join(f"| {label} | {' | '.join(cells)} |".split()) in LONG
+
+
+def test_each_way_to_be_taught_is_on_the_long_page() -> None:
+    def cell(figures: dict) -> str:
+        x = {key: figure["value"] for key, figure in figures.items()}
+        said = f"{100 * x['over_random']:.0f} / {x['return']:.0f} / {100 * x['crossed']:.0f}"
+        return f"{said} / {100 * x['crash']:.1f}"
+
+    for label, seeds in report("demonstrations").items():
+        cells = [cell(seeds[seed]) if seed in seeds else "" for seed in "01"]
         assert " ".join(f"| {label} | {' | '.join(cells)} |".split()) in LONG
 
 

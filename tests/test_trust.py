@@ -33,9 +33,9 @@ import pytest
 import torch
 
 import deepflight
-from deepflight import configure, train
+from deepflight import TEACHER, configure, train
 from dqn import QNetwork, Replay, load, load_weights, lock_folder, save, save_weights
-from env import Fleet, ForestEnv, World, fly, laser_pilot
+from env import Fleet, ForestEnv, World, fly, laser_pilot, teach
 
 CHECKPOINT = "checkpoint.pt"
 ROOT = Path(__file__).parent.parent
@@ -168,6 +168,22 @@ def test_with_a_teacher_and_demonstrations_too(tmp_path: Path, watched: None) ->
     assert np.array_equal(whole.replay.scores, cut.replay.scores)
     assert whole.replay.scores.any(2).all()
     assert load(tmp_path / "cut" / CHECKPOINT, "checkpoint")["demos"] == demos
+    first = (tmp_path / "whole/log.csv").read_text().splitlines()[1].split(",")
+    assert (first[0], first[2]) == ("8", "3"), "tested after 3 updates, and before it flies alone"
+
+
+def test_where_q_would_explore_the_teacher_flies(tmp_path: Path, watched: None) -> None:
+    c, r = configure(TEACHER | SMALL | {"teacher": True, "epsilon_final": 1.0, "steps": 240})
+    train(c, r, tmp_path)
+    fleet, alone = Watched.runs[-1].fleet, Fleet(World(), 1, camera=False)
+    for lane in (0, 1):
+        seed, actions = fleet.records[lane][0]
+        assert len(actions) == 240 // 8
+        alone.reset([0], [seed])
+        for a in actions:
+            paid = r.forward_reward, r.goal_value, r.far_value
+            assert teach(alone, c.gamma, *paid).argmax() == a
+            alone.step([a])
 
 
 def test_a_truncated_flight_comes_back_with_its_last_frame(

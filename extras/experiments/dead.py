@@ -25,7 +25,7 @@ from dqn import DQNConfig, QNetwork, load, load_weights
 from env import World, fly, laser_pilot, refly
 
 ROOT = Path(__file__).parents[2]
-SHIPPED = ("weights/paper.pt", "weights/beacon.pt")
+SHIPPED = tuple(f"weights/{x}.pt" for x in ("paper", "beacon", "scratch", "beacon-scratch"))
 FORESTS = 10
 
 

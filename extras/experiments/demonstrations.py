@@ -9,7 +9,7 @@
 The demonstrations are 32 flights of the laser pilot. What has been flown is not trained again.
 `fly` flies what best.pt keeps, and the laser pilot itself, through the 200 forests of the ladder,
 adds them to results/demonstrations.json, and copies logs and settings to results/demos/. `count`
-learns from 8 to 512 demonstrated flights alone, with two seeds, and flies the same forests. `draw`
+learns from 8 to 512 demonstrated flights alone, with seed 0, and flies the same forests. `draw`
 draws figures/demonstrations.png from all that.
 """
 
@@ -39,8 +39,8 @@ KINDS = {  # label -> flags
     "from scratch": [],
     "demonstrations before": ["--demos", str(DEMO_FILE), "--demo-share", "0"],
     "before and during": ["--demos", str(DEMO_FILE)],
-    "teacher in the loop": ["--teacher"],
-    "imitation alone": ["--teacher", "--no-bellman"],
+    "teacher in the loop": ["--teacher", "--bellman"],
+    "imitation alone": ["--teacher"],
 }
 PANELS = {  # figure -> title, factor
     "over_random": ("flight time over random, %", 100),
@@ -117,10 +117,9 @@ def count_all() -> None:
     flights, (c, rc) = demonstrate(max(COUNTS)), configure(DEMOS)
     for count in COUNTS:
         lesson = recall([(f["seed"], f["actions"]) for f in flights[:count]], c, rc)
-        for seed in SEEDS:
-            agent = Agent(c, World.actions, seed)
-            rehearse(agent, lesson, c, np.random.default_rng(seed))
-            note(f"{count} demonstrations", seed, fly(dqn_pilot(agent.q), FORESTS, World()))
+        agent = Agent(c, World.actions, 0)
+        rehearse(agent, lesson, c, np.random.default_rng(0))
+        note(f"{count} demonstrations", 0, fly(dqn_pilot(agent.q), FORESTS, World()))
 
 
 def draw() -> None:
@@ -137,10 +136,9 @@ def draw() -> None:
                     minutes = [float(row["seconds"]) / 60 for row in csv.DictReader(file)]
                 for panel, x in ((top, step), (mid, minutes)):
                     panel.plot(x, factor * y, f"C{i}", linewidth=1.2, label=name)
-        for seed in SEEDS:
-            found = [report[f"{count} demonstrations"][str(seed)][key] for count in COUNTS]
-            value, least, most = (factor * np.array([f[x] for f in found]) for x in INTERVAL)
-            low.errorbar(COUNTS, value, (value - least, most - value), fmt="o-", color=f"C{seed}")
+        found = [report[f"{count} demonstrations"]["0"][key] for count in COUNTS]
+        value, least, most = (factor * np.array([f[x] for f in found]) for x in INTERVAL)
+        low.errorbar(COUNTS, value, (value - least, most - value), fmt="o-")
         teacher = factor * report["the teacher itself"]["0"][key]["value"]
         for panel, below in ((top, "control steps"), (mid, "minutes"), (low, "demonstrations")):
             panel.axhline(teacher, color="grey", linestyle=":")

@@ -3,8 +3,8 @@
     extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.experiments.figures
 
-figures/learning.png: every log in results/ of the recipe is a training, and so is rung 0 of the
-ladder; each is a curve, against control steps and against flights.
+figures/learning.png: a curve is a training, from rewards or taught, against control steps and
+against flights; Mnih's settings are rung 0 of the ladder.
 figures/crossed.png: what crosses in the paper's world, beside the laser pilot with and without a
 compass. figures/flight.gif: a flight of results/eval.json, flown again, with the values that
 weights/paper.pt gives to each turn.
@@ -34,9 +34,11 @@ PANELS = {  # column of log.csv -> title
     "test_steps": "Figure 4: flight time on the test forests, steps",
 }
 CURVES = {  # label -> folders in results/, one a seed, and the colour in the picture
-    "the paper's world": ("paper*", "C0"),
-    "with the beacon": ("beacon", "C1"),
+    "from rewards": ("scratch*", "C0"),
+    "with the beacon": ("beacon-scratch", "C1"),
     "Mnih's settings": ("ladder/0-0", "C2"),
+    "taught": ("paper", "C3"),
+    "taught, with the beacon": ("beacon", "C4"),
 }
 AXES = {"step": "control steps", "episodes": "flights"}  # column of log.csv -> label
 Log = dict[str, np.ndarray]  # the columns of a log.csv (T,)
@@ -88,17 +90,19 @@ def draw_learning() -> None:
                 axes.set_title(title, fontsize=11)
     handles, labels = axes.get_legend_handles_labels()
     legend = dict(zip(labels, handles, strict=True))  # each label once
-    figure.legend(legend.values(), legend, fontsize=9, ncols=5, loc="outside lower center")
+    figure.legend(legend.values(), legend, fontsize=9, ncols=4, loc="outside lower center")
     finish(figure, "learning.png")
 
 
 def draw_crossed() -> None:
     """The share of test flights that cross, a mean over five test points."""
     figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
-    for seed, log in enumerate(logs("paper*")):
-        label = f"the camera pilot, seed {seed}"
+    for seed, log in enumerate(logs("scratch*")):
+        label = f"from rewards, seed {seed}"
         share = np.convolve(100 * log["test_crossed"], np.ones(5) / 5, "valid")  # (T - 4,) %
         axes.plot(log["step"][4:], share, f"C{seed}", label=label, linewidth=1.2)
+    (log,) = logs("paper")
+    axes.plot(log["step"], 100 * log["test_crossed"], "C3", label="taught", linewidth=1.2)
     laser = json.loads((ROOT / "results/compass.json").read_text())
     for way, line in (("straight on", ":"), ("by compass", "--")):
         y = laser[f"the laser pilot, {way}: crossed, %"]

@@ -6,7 +6,7 @@
 
 `train` trains rung 0, Mnih's own settings, for 1.4 million steps, rungs 1 to 7 with two seeds for
 100,000, and rung 8, the default recipe, with three. Each has one thread, and two run at a time, in
-runs/ladder-RUNG-SEED; those of the recipe in runs/paper, runs/paper-1 and runs/paper-2. Beside the
+runs/ladder-RUNG-SEED; those of the recipe in runs/scratch, scratch-1 and scratch-2. Beside the
 rungs it trains the controls: rung 7 with another loss or learning rate, and with two seeds, rung 7
 without the pieces that do not stand out. What has been flown is not trained again. `fly` flies two
 networks of each through 200 forests that no training, test or evaluation uses: what best.pt keeps,
@@ -93,7 +93,7 @@ def trainings() -> Iterator[tuple[str, str, int, list[str]]]:
         for seed in SEEDS:
             yield f"ladder-{label[0]}-{seed}", label, seed, flags
     for seed in (*SEEDS, 2):
-        yield f"paper-{seed}".removesuffix("-0"), "8 the recipe", seed, []
+        yield f"scratch-{seed}".removesuffix("-0"), "8 the recipe", seed, []
     for i, (label, more) in enumerate(CONTROLS.items()):
         for seed in SEEDS if label.startswith("without") else SEEDS[:1]:
             yield f"ladder-{'abcde'[i]}-{seed}", label, seed, ["--steps", str(STEPS), *more]

@@ -47,7 +47,7 @@ def test_each_training_of_the_ladder_has_a_folder_of_its_own_and_legal_settings(
 def test_a_committed_training_stands_within_its_own_band(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    shutil.copytree(ROOT / "results/paper", tmp_path / "run")
+    shutil.copytree(ROOT / "results/scratch", tmp_path / "run")
     assert compare.main([str(tmp_path / "run")]) == 0
     assert capsys.readouterr().out.count(", within ") == len(compare.PANELS)
     assert (tmp_path / "run/compare.png").stat().st_size > 10_000
@@ -59,7 +59,7 @@ def test_a_training_without_a_log_or_with_settings_that_no_seed_had_is_refused(
 ) -> None:
     assert compare.main([str(tmp_path)]) == 2
     assert "give a training's folder" in capsys.readouterr().err
-    shutil.copytree(ROOT / "results/paper", tmp_path / "run")
+    shutil.copytree(ROOT / "results/scratch", tmp_path / "run")
     config = tmp_path / "run/config.json"
     config.write_text(json.dumps(json.loads(config.read_text()) | {"gamma": 0.5}))
     assert compare.main([str(tmp_path / "run")]) == 2
