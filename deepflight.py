@@ -68,7 +68,6 @@ import numpy as np
 import torch
 from numpy import ndarray
 from numpy.random import Generator
-from torch import Tensor
 
 import dqn
 import env
@@ -166,7 +165,7 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #                       labels of ten are 0, and one is -10, a crash: Q should be their mean, -1. An
 #                       error pulls Q by the slope of the loss. If that is at most 1, Q comes to
 #                       rest where 9 * (0 - Q) = 1, at -0.11: the crash is nearly ignored. If it may
-#                       be 10, Q becomes -1. (PyTorch divides this loss by 10, so all pulls alike)
+#                       be 10, Q becomes -1. (PyTorch divides this loss, and so every pull, by 10)
 #     [+average]        in the last tenth of the steps the mean of Q's weights is taken, to be
 #                       flown: every update changes how Q flies, and a mean is steady
 #     [+teacher] [+demos]    off by default; they have a section of their own, after `train`
@@ -234,7 +233,14 @@ def draw(replay: Replay, lesson: Replay | None, c: DQNConfig, rng: Generator) ->
 def learn(agent: Agent, b: dqn.Batch, c: DQNConfig) -> None:
     """Lines 13 to 15: move the weights once, and now and then renew Q^."""
     q = agent.q(b.s, agent.bfloat16)  # (B, A) [+bfloat16]
-    agent.loss = td_loss(agent, q, b, c) if c.bellman else torch.zeros(())
+    agent.loss = torch.zeros(())
+    if c.bellman:
+        with torch.no_grad():
+            q2 = agent.q_target(b.s2, agent.bfloat16)  # (B, A)
+            q2_online = agent.q(b.s2, agent.bfloat16) if c.double else q2  # (B, A) [+double]
+            y = td_target(b.r, b.gamma_n, b.end, q2, q2_online)  # 13 (B,)
+        q_sa = q.gather(1, b.a[:, None])[:, 0]  # (B,)
+        agent.loss = torch.nn.functional.smooth_l1_loss(q_sa, y, beta=c.huber)  # 14 [+huber]
     if c.teacher:  # [+teacher]
         agent.loss = agent.loss + dqn.teacher_loss(q, b.scores)
     if b.shown.any():  # [+demos]
@@ -247,16 +253,6 @@ def learn(agent: Agent, b: dqn.Batch, c: DQNConfig) -> None:
         agent.q_target.load_state_dict(agent.q.state_dict())  # 15
 
 
-def td_loss(agent: Agent, q: Tensor, b: dqn.Batch, c: DQNConfig) -> Tensor:
-    """How far Q is from its labels. q (B, A): Q(s, .)."""
-    with torch.no_grad():
-        q2 = agent.q_target(b.s2, agent.bfloat16)  # (B, A)
-        q2_online = agent.q(b.s2, agent.bfloat16) if c.double else q2  # (B, A) [+double]
-        y = td_target(b.r, b.gamma_n, b.end, q2, q2_online)  # 13 (B,)
-    q_sa = q.gather(1, b.a[:, None])[:, 0]  # (B,)
-    return torch.nn.functional.smooth_l1_loss(q_sa, y, beta=c.huber)  # 14 [+huber]
-
-
 # -------------------------------------------------- other settings
 
 # With the beacon the goal can be seen. So no other way out should be worth as much. Metres are not
@@ -265,7 +261,8 @@ def td_loss(agent: Agent, q: Tensor, b: dqn.Batch, c: DQNConfig) -> Tensor:
 BEACON = {"steps": 400_000, "forward_reward": 0.0, "far_value": 50.0}
 # A teacher acts where Q would explore, until Q acts alone. It knows where the far edge is, so less
 # pay for metres and for that edge is enough. 115 was found by trial: with 125 the pilot leaves
-# sooner, and earns less; with 80 it stays longer, earns much more, and crosses less often.
+# sooner, and earns less; with 80, and half the pay for metres, it stays longer, earns more, and
+# crosses less often.
 TEACHER = dict(
     bellman=False, learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000,
     lr_decay=0.0, test_every=20_000, forward_reward=1.0, far_value=115.0,
@@ -312,6 +309,7 @@ FLAGS = {"demos": DEMOS, "teacher": TEACHER, "beacon": BEACON}
 # Somebody took action a in state s, and that is all that a flight says. So Q(s, a) should be the
 # greatest of the nine, by a margin (dqn.margin_loss) [Hester 2018]. The network learns from these
 # flights alone at first. Later a quarter of each batch is theirs. Their rewards count like others.
+# As measured in results/README.md, that quarter does harm: `--demo-share 0` leaves it out.
 
 
 def teach(fleet: Fleet, c: DQNConfig, rc: RunConfig) -> ndarray | float:
@@ -334,7 +332,7 @@ def recall(demos: env.Record, c: DQNConfig, rc: RunConfig) -> Replay:
     steps, fleet = sum(len(actions) for _, actions in demos), Fleet(World(beacon=rc.beacon), 1)
     if steps < (least := c.n_steps + 4):  # see `configure`
         raise ValueError(f"demonstrations have {steps} steps, allowed are {least} or more")
-    lesson = Replay(steps, 1, c.teacher * env.World.actions, shown=True)
+    lesson = Replay(steps, 1, env.World.actions if c.teacher else 0, shown=True)
     for i, (seed, actions) in enumerate(demos):
         show(f"flying demonstration {i + 1:,} of {len(demos):,}")
         fleet.reset([0], [seed])
