@@ -134,7 +134,7 @@ def test_the_atlas_says_what_the_pages_say() -> None:
     atlas = report("atlas")
     dense, speed = atlas["densities"].index(2.0), atlas["speeds"].index(5.0)
     camera, laser = (100 * atlas["crossed"][x][dense][speed] for x in ("camera, beacon", "laser"))
-    assert f"the beacon pilot crosses {camera:.0f} %, and the laser {laser:.0f} %." in FLAT
+    assert f"crosses {camera:.0f} % at 5 m/s, and the laser {laser:.0f} %." in LONG
     crashes = [flight for flight in atlas["worst"] if flight["outcome"] == "crash"]
     assert len(crashes) < len(atlas["worst"])  # so these are all of the crashes
     late = sum(flight["progress"] > 90 - 12 for flight in crashes)
@@ -145,11 +145,13 @@ def test_the_atlas_says_what_the_pages_say() -> None:
 
 
 def test_the_clock_on_the_pages_is_the_measured_one() -> None:
-    clock = report("clock")
-    steps = max(seed["step"] for seed in clock["seeds"].values())
+    rewards, taught = (report("clock")[name] for name in ("from rewards", "taught"))
+    steps, later = (max(s["step"] for s in x["seeds"].values()) for x in (rewards, taught))
     assert f"After {steps:,} of its" in FLAT
-    assert f"or {clock['median']:.0f} seconds, it flies over" in FLAT
-    assert f"after {clock['median']:.0f} s and at most {steps:,} steps" in LONG
+    assert f"or {rewards['median']:.0f} seconds, it flies over" in FLAT
+    assert f"after {rewards['median']:.0f} s and at most {steps:,} steps" in LONG
+    assert f"After {later:,} steps, or {taught['median']:.0f} seconds, half of its" in FLAT
+    assert f"after {taught['median']:.0f} s and at most {later:,} steps" in LONG
 
 
 def test_the_minutes_of_a_training_are_those_of_its_log() -> None:
