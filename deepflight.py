@@ -39,6 +39,12 @@ Legend
 
 Not in this file: how pictures are drawn (render.py), drones fly (env.py) or networks learn (dqn.py
 has the parts, and `train` puts them together).
+
+Sources, beside those of dqn.py
+    [DF]            Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
+    [Ng 1999]       Policy invariance under reward transformations, ICML
+    [Ross 2011]     A reduction of imitation learning to no-regret online learning, AISTATS
+    [Wilson 1927]   Probable inference, the law of succession, and statistical inference, JASA 22
 """
 
 import signal
@@ -122,8 +128,9 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 
     The field calls this reward shaping. A policy is a rule that picks the action in every state.
     One kind of it leaves the best policy as it is: what it pays for a step forward, it takes for
-    the step back (potential-based shaping [Ng 1999]). The pay for metres is nearly of that kind.
-    The prizes are not, and are meant to change the policy. All this is for the network alone. Every
+    the step back (potential-based shaping [Ng 1999]). The pay for metres would be of that kind if
+    it were gamma * x2 - x, and it is x2 - x. The prizes are not, and are meant to change the
+    policy. All this is for the network alone. Every
     reward that is printed or logged is the paper's.
     """
     forward = np.array([info["forward"] for info in infos])  # (L,) m
@@ -175,8 +182,8 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #     run = Run(...)    makes the files; or, given a checkpoint, sets agent, replay, fleet and rng
 #                       to what they were there
 #     run.steps()       8, 16, 24, ...: eight drones fly, so each pass makes eight control steps
-#     run.due(4)        how often something that is due every 4 steps is due in this pass: of the
-#                       steps 9 to 16 two are multiples of 4, so two updates are due
+#     run.due(4)        how often something is due in this pass that is due every 4 steps. Say that
+#                       this pass makes steps 9 to 16. 12 and 16 are multiples of 4: two updates
 #     run.last_share    whether this is the last tenth of all steps
 #     run.note()        counts flights, shows progress
 #     run.test()        flies the test forests, saves, keeps the weights of the best test in
@@ -225,7 +232,8 @@ def draw(replay: Replay, lesson: Replay | None, c: DQNConfig, rng: Generator) ->
     shown = round(c.demo_share * c.batch_size) if lesson else 0
     parts = [(replay, c.batch_size - shown), (lesson, shown)]
     drawn = [part.sample(n, c.n_steps, c.gamma, rng) for part, n in parts if n]  # [+n_steps]
-    batch = dqn.Batch(*map(np.concatenate, zip(*drawn, strict=True)))  # end to end, each field
+    fields = zip(*drawn, strict=True)  # s of all parts, then a of all parts, ...
+    batch = dqn.Batch(*(np.concatenate(field) for field in fields))  # all with B rows
     batch = mirror(batch, env.World.actions, rng) if c.mirror else batch  # [+mirror]
     return dqn.Batch(*map(torch.from_numpy, batch))
 

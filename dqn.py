@@ -116,6 +116,11 @@ Legend
     T         rows of the replay
 
 Not in this file: the forest, prioritized replay, distributional values, noisy layers.
+
+Sources
+    [Mnih15]             Human-level control through deep reinforcement learning, Nature 518
+    [van Hasselt 2016]   Deep reinforcement learning with double Q-learning, AAAI
+    [Hester 2018]        Deep Q-learning from demonstrations, AAAI
 """
 
 import fcntl

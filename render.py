@@ -111,9 +111,9 @@ def raycast(
     cos, sin, rays = np.cos(bearings), np.sin(bearings), len(bearings)
     along = trunks @ np.array([cos, sin])  # (N, M) m: x * cos + y * sin
     across = trunks @ np.array([-sin, cos])  # (N, M) m: y * cos - x * sin
-    # A pair of a trunk and a ray is one number: trunk * M + ray. A ray of one of E eyes is one
-    # number too, its place: eye * M + ray. With M = 84, pair 700 is trunk 8, ray 28. If eye 1 looks
-    # at trunk 8, the ray's place is 1 * 84 + 28 = 112.
+    # flatnonzero numbers the cells of the table (N, M) row by row, so with M = 84 its cell 700 is
+    # trunk 700 // 84 = 8 and ray 700 % 84 = 28. The rays of several eyes stand end to end. If eye 1
+    # looks at trunk 8, that ray is number 1 * 84 + 28 = 112 of all: its place.
     meet = np.flatnonzero(np.abs(across) < radius)  # (H,) the pairs that meet
     half_chord = np.sqrt(radius**2 - across.ravel()[meet] ** 2)  # (H,) m
     distance = along.ravel()[meet] - half_chord  # (H,) m; the trunk is behind if below 0
@@ -203,9 +203,9 @@ def pole_distance(goal: ndarray, scene: Scene) -> ndarray:
     """How far away every column's ray meets the goal's pole: (E * 84,) m, inf where it does not.
 
     goal (E, 2): how far ahead and to the left of each eye the pole stands, m. raycast knows one
-    radius only. But a pole twice as thick as a trunk, and twice as far away, looks as wide. So the
-    pole is brought nearer by scale = pole's radius / trunk's radius, cast like a trunk, and its
-    distance is multiplied by scale.
+    radius only. But a pole that is twice as thick as a trunk, and twice as far away, looks like it.
+    So let scale = pole's radius / trunk's radius. Cast a trunk at 1 / scale of the pole's distance,
+    and multiply the distance that comes out by scale.
     """
     least = scene.beacon_pixels / 2 / FOCAL * goal[:, 0]  # (E,) m, the least radius to draw
     scale = np.maximum(scene.beacon_radius, least) / scene.trunk_radius  # (E,)
@@ -290,7 +290,7 @@ def draw_panel(
     for a, height in enumerate(heights):
         x, colour = 224 * (1 - (a + 1) / actions) + 4, "#d62728" if a == action else "#9a9a90"
         draw.rectangle([x, 304 - 60 * height, x + 224 / actions - 4, 306], fill=colour)
-    draw.text((4, 310), "left    Q, the value of each turn    right", fill="black", font_size=13)
+    draw.text((4, 310), "left    what each turn is worth    right", fill="black", font_size=13)
     draw.text((248, 242), "\n".join(lines), fill="black", font_size=19, spacing=8)
     return image
 
