@@ -2,6 +2,7 @@
 
     python deepflight.py train                  the default recipe, in the paper's world
     python deepflight.py train --beacon         where a pole makes the goal visible
+    python deepflight.py train --camera disparity   by how near things are, not how bright
     python deepflight.py train --teacher        a planner with a laser says what turns are worth
     python deepflight.py train --demos FILE     learn first from flights that eval --json wrote
     python deepflight.py train --preset dqn     textbook DQN, but with Adam and eight drones
@@ -92,6 +93,7 @@ class RunConfig:
 
     seed: int = dqn.setting(0, "of everything random", 0, 1e18)
     beacon: bool = dqn.setting(False, "put a visible pole at the goal", 0, 1)
+    camera: str = dqn.setting("grey", "what its pictures say of each point", *render.CAMERAS)
     threads: int = dqn.setting(2, "of the CPU; another number rounds sums otherwise", 1, CORES)
     test_every: int = dqn.setting(5_000, "control steps between test points, which also save", 1)
     forward_reward: float = dqn.setting(2.0, "[+] paid per metre flown forward; 0: off", 0, 1e3)
@@ -194,7 +196,7 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: Any = None, demos: A
     """Algorithm 1 of [Mnih15]; numbers in comments are its lines, listed in dqn.py. folder: of the
     run's files. saved: a checkpoint to go on with. demos: demonstrated flights, an `env.Record`.
     Returns the exit code."""
-    world, rng = World(beacon=rc.beacon), np.random.default_rng(rc.seed)
+    world, rng = World(beacon=rc.beacon, camera=rc.camera), np.random.default_rng(rc.seed)
     replay = Replay(c.replay_size, c.num_envs, world.actions if c.teacher else 0)  # 1
     agent = Agent(c, world.actions, rc.seed)  # 2, 3
     fleet = Fleet(world, c.num_envs)  # [+num_envs]
@@ -337,7 +339,8 @@ def rehearse(agent: Agent, lesson: Replay, c: DQNConfig, rng: Generator) -> None
 
 def recall(demos: env.Record, c: DQNConfig, rc: RunConfig) -> Replay:
     """[+demos] A replay of demonstrated flights, in one lane, made by flying them again."""
-    steps, fleet = sum(len(actions) for _, actions in demos), Fleet(World(beacon=rc.beacon), 1)
+    fleet = Fleet(World(beacon=rc.beacon, camera=rc.camera), 1)
+    steps = sum(len(actions) for _, actions in demos)
     if steps < (least := c.n_steps + 4):  # see `configure`
         raise ValueError(f"demonstrations have {steps} steps, allowed are {least} or more")
     lesson = Replay(steps, 1, env.World.actions if c.teacher else 0, shown=True)
@@ -377,7 +380,7 @@ def read_demos(path: Path, beacon: bool) -> env.Record:
         for i, flight in enumerate(flights):
             show(f"checking demonstration {i + 1:,} of {len(demos):,}")
             env.whole_number("seed", flight["seed"], TRAIN_END - 1)
-            steps = [*refly(*demos[i], World(), camera=False)]
+            steps = [*refly(*demos[i], World(), blind=True)]
             *_, info = steps[-1]
             same = info["outcome"] and info["outcome"] == flight["outcome"]
             same = same and info["edge"] == flight["edge"]
@@ -401,14 +404,14 @@ def dqn_pilot(q: QNetwork) -> Pilot:
 def evaluate(args: argparse.Namespace) -> int:
     """Fly every pilot through the same forests; print the table, write JSON and a film."""
     q, gif = load_pilot(args), args.out / "flight.gif"
-    world, rng = World(beacon=args.beacon), np.random.default_rng(0)
+    world, rng = World(beacon=args.beacon, camera=args.camera), np.random.default_rng(0)
     seeds = range(args.first_seed, args.first_seed + args.episodes)
     pilots = {"straight": env.straight_pilot, "laser": env.laser_pilot(DQNConfig.gamma)}
     pilots["dqn"] = dqn_pilot(q)
     bar = fly_random(seeds, world, rng)
     flights: dict[str, Flights] = {}
     for p in args.pilots:
-        flights[p] = bar if p == "random" else fly(pilots[p], seeds, world, camera=p == "dqn")
+        flights[p] = bar if p == "random" else fly(pilots[p], seeds, world, blind=p != "dqn")
     draws = rng.integers(len(seeds), size=(2000, len(seeds)))  # (2000, forests) resampled
     figures = {p: summarize(flights[p], bar, draws) for p in flights}
     many = f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n"
@@ -416,7 +419,7 @@ def evaluate(args: argparse.Namespace) -> int:
     print_table(figures)
     if args.json:
         report = {"program": "Deep Flight", "weights": str(args.weights), "beacon": args.beacon}
-        report |= {"first_seed": seeds[0], "forests": len(seeds)}
+        report |= {"camera": args.camera, "first_seed": seeds[0], "forests": len(seeds)}
         report["pilots"] = {p: figures[p] | {"flights": flights[p]} for p in flights}
         with dqn.whole_file(args.json) as file:
             file.write(json.dumps(report).encode())
@@ -509,7 +512,7 @@ def film(flown: dict[str, dict], world: World, q: QNetwork) -> Iterator[render.I
 
 def track(flight: dict[str, Any], world: World) -> tuple[ndarray, str]:
     """Where a flight went (T, 2) in m, by flying it again, and its edge or outcome."""
-    steps = refly(flight["seed"], flight["actions"], world, camera=False)
+    steps = refly(flight["seed"], flight["actions"], world, blind=True)
     return np.array([info["pose"][:2] for *_, info in steps]), flight["edge"] or flight["outcome"]
 
 
@@ -617,7 +620,8 @@ class Run:
         with dqn.whole_file(self.folder / "log.csv") as file:
             file.write("\n".join([*book["log"], ""]).encode())
         if late or score > book["best"]:
-            dqn.save_weights(self.folder / "best.pt", q, beacon=self.rc.beacon)
+            seen = {"beacon": self.rc.beacon, "camera": self.rc.camera}
+            dqn.save_weights(self.folder / "best.pt", q, **seen)
             book["best"] = score
         self.save()  # and then print, which may fail
         say(ROW.format(**row | self.clock))
@@ -721,7 +725,8 @@ def place(text: str) -> Path:
 
 def describe(f: Field) -> str:
     """The help of a setting's flag: what it is, what is allowed, what the presets make of it."""
-    legal = "{:,g} to {:,g}".format(*f.metadata["legal"]) if f.type is not bool else "true or false"
+    legal = {bool: "true or false", str: "{} or {}"}.get(f.type, "{:,g} to {:,g}")
+    legal = legal.format(*f.metadata["legal"])
     presets = PRESETS | FLAGS
     changes = [f"; {name} {presets[name][f.name]}" for name in presets if f.name in presets[name]]
     return f"{f.metadata['help']} ({legal}; default {f.default}{''.join(changes)})"
@@ -749,6 +754,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     sub.add_argument("--weights", type=place, help="default: weights/paper.pt or weights/beacon.pt")
     more = {"choices": names, "default": names, "metavar": "PILOT"}
     sub.add_argument("--pilots", nargs="+", **more, help=f"of {', '.join(names)}; default: all")
+    more = {"choices": render.CAMERAS, "default": "grey", "metavar": "KIND"}
+    sub.add_argument("--camera", **more, help="what its pictures say: grey or disparity")
     more = {"type": int, "metavar": "N"}
     sub.add_argument("--episodes", **more, default=100, help="forests, up to 10,000; default: 100")
     first = "forest to begin with, up to 1e18; default: %(default)s"
@@ -848,8 +855,9 @@ def load_pilot(args: argparse.Namespace) -> QNetwork:
             raise ValueError(f"{name} is {value}, allowed are whole numbers from {low} to {high:,}")
     torch.set_num_threads(args.threads)
     shipped = Path(__file__).resolve().parent / "weights"
-    args.weights = args.weights or shipped / ("beacon.pt" if args.beacon else "paper.pt")
-    q = dqn.load_weights(args.weights, World.actions, beacon=args.beacon)
+    name = "beacon" if args.beacon else "paper" if args.camera == "grey" else args.camera
+    args.weights = args.weights or shipped / f"{name}.pt"
+    q = dqn.load_weights(args.weights, World.actions, beacon=args.beacon, camera=args.camera)
     dqn.check_output(args.out / "flight.gif", b"GIF8.*Deep Flight")
     if args.json:
         dqn.check_output(args.json, b'{"program": "Deep Flight"')

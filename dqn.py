@@ -151,8 +151,9 @@ from torch.optim.swa_utils import AveragedModel
 LIVE, TRUNCATED, TERMINAL = range(3)
 
 
-def setting(value: Any, text: str, low: float, high: float = 1e9) -> Any:
-    """One field of the settings: its default, a text with unit and source, and what is allowed."""
+def setting(value: Any, text: str, low: Any, high: Any = 1e9) -> Any:
+    """One field of the settings: its default, a text with unit and source, and what is allowed:
+    from low to high, or one of two words."""
     return field(default=value, metadata={"help": text, "legal": (low, high)})
 
 

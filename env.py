@@ -77,7 +77,7 @@ import numpy as np
 import pymunk
 from numpy import ndarray
 
-from render import PIXELS, Scene, camera, raycast
+from render import CAMERAS, PIXELS, Scene, camera, raycast
 
 STACK = 4  # pictures in an observation [DF §II-A]
 Record = list[tuple[int, str]]  # flights: seed and actions of each, which are all of it
@@ -162,13 +162,13 @@ class ForestEnv:
     Observation: (4, 84, 84) uint8, oldest picture first, the first one repeated at reset. It is a
     copy, so writing into it changes nothing here.
     Action: an int, 0 turns right at 0.7 rad/s, 4 flies straight, 8 turns left.
-    `camera=False` leaves the pictures black, for pilots that do not look at them.
+    `blind=True` leaves the pictures black, for pilots that do not look at them.
     pymunk in short: a space holds shapes, the trunks, and moves bodies, the drone. A kinematic body
     goes where its velocity says, and nothing pushes it.
     """
 
-    def __init__(self, world: World | None = None, *, camera: bool = True) -> None:
-        self.world, self.has_camera = world or World(), camera
+    def __init__(self, world: World | None = None, *, blind: bool = False) -> None:
+        self.world, self.blind = world or World(), blind
         self.goal = pymunk.Vec2d(self.world.length, 0.0)  # m, mid of the far edge
         self.space = pymunk.Space()
         ground, radius = self.space.static_body, self.world.trunk_radius
@@ -279,18 +279,18 @@ EVERYTHING = pymunk.ShapeFilter()  # a query that leaves nothing out
 def look(envs: Sequence[ForestEnv]) -> ndarray:
     """What each of F drones sees, drawn in one call: pictures (F, 84, 84) uint8."""
     world = envs[0].world
-    if not envs[0].has_camera:
+    if envs[0].blind:
         return np.zeros((len(envs), PIXELS, PIXELS), np.uint8)
     poses = np.array([env.pose for env in envs])  # (F, 3)
     return camera(poses, [e.trunks for e in envs], world, envs[0].goal if world.beacon else None)
 
 
-def refly(seed: int, actions: Iterable, world: World, *, camera: bool = True) -> Iterator[tuple]:
+def refly(seed: int, actions: Iterable, world: World, *, blind: bool = False) -> Iterator[tuple]:
     """Fly a recorded flight again: yields what `step` returned, the reset (reward 0) first.
 
     actions: numbers, or the digits that `ForestEnv.flight` writes.
     """
-    env = ForestEnv(world, camera=camera)
+    env = ForestEnv(world, blind=blind)
     observation, info = env.reset(seed=seed)
     yield observation, 0.0, False, False, info
     for action in actions:
@@ -306,8 +306,8 @@ class Fleet:
     flights, seeds and actions: that is all it takes to fly them again.
     """
 
-    def __init__(self, world: World, lanes: int, *, camera: bool = True) -> None:
-        self.world, self.envs = world, [ForestEnv(world, camera=camera) for _ in range(lanes)]
+    def __init__(self, world: World, lanes: int, *, blind: bool = False) -> None:
+        self.world, self.envs = world, [ForestEnv(world, blind=blind) for _ in range(lanes)]
         self.records: list[list[tuple[int, list[int]]]] = [[] for _ in range(lanes)]
 
     @property
@@ -460,10 +460,10 @@ def ways(world: World) -> tuple[ndarray, ndarray]:
     return np.cumsum(world.speed * world.dt * np.exp(1j * headings), 1), headings
 
 
-def fly(pilot: Pilot, seeds: Sequence[int], world: World, *, camera: bool = True) -> Flights:
+def fly(pilot: Pilot, seeds: Sequence[int], world: World, *, blind: bool = False) -> Flights:
     """Fly one forest per seed, a hundred at once; returns the flights in the order of the seeds."""
     flights: Flights = []
-    fleet = Fleet(world, min(len(seeds), 100), camera=camera)
+    fleet = Fleet(world, min(len(seeds), 100), blind=blind)
     for group in (seeds[i : i + 100] for i in range(0, len(seeds), 100)):
         fleet.reset(range(len(group)), group)
         while flying := fleet.flying:
@@ -478,7 +478,7 @@ def fly_random(seeds: Sequence[int], world: World, rng: np.random.Generator) -> 
     """The bar that others are compared with: 2,000 random flights or more, equally many through
     each forest. The mean of only a hundred could be off by a fifth."""
     repeats = math.ceil(2000 / len(seeds))
-    return fly(random_pilot(rng), list(seeds) * repeats, world, camera=False)
+    return fly(random_pilot(rng), list(seeds) * repeats, world, blind=True)
 
 
 def measure(flights: Flights) -> dict[str, ndarray]:
@@ -518,6 +518,7 @@ LIMITS = dict.fromkeys(("first_x", "first_y", "r_safe", "r_precrash", "r_crash")
 LIMITS |= dict.fromkeys(("back", "jitter_x", "jitter_y", "beacon_pixels"), (0, 1e4))
 LIMITS |= dict.fromkeys(("sky", "ground", "trunk_facing", "trunk_grazing", "beacon_grey"), (0, 255))
 LIMITS |= {"rows": (0, 1e4), "columns": (0, 1e4), "beacon": (0, 1), "actions": (2, 10)}
+LIMITS |= {"camera": CAMERAS}
 
 
 def whole_number(name: str, value: Any, high: float = math.inf) -> int:
@@ -540,6 +541,10 @@ def check_numbers(settings: Any, limits: dict[str, tuple[float, float]]) -> None
     """Raise ValueError if a field of a dataclass is of another type or outside its limits."""
     for f in fields(settings):
         value, (low, high) = getattr(settings, f.name), limits.get(f.name, (1e-3, 1e4))
+        if f.type is str:
+            if value not in (low, high):
+                raise ValueError(f"{f.name} is {value!r}, allowed are {low} and {high}")
+            continue
         kind, words = KINDS[f.type]
         if (isinstance(value, bool) and kind is not bool) or not isinstance(value, kind):
             raise ValueError(f"{f.name} is {value!r}, allowed are {words}")

@@ -42,6 +42,10 @@ A picture, in words: for each column, cast its ray. If it hits bark, work out th
 the rows of the trunk's top and foot. Fill the rows between with dark grey, which fades into the
 sky's grey with distance. All other rows are sky above the horizon, and ground below.
 
+That is the grey camera. The disparity camera has the same outlines. It says of each point how near
+it is, 510 / depth in metres, as a stereo camera measures it, and 0 of the sky. Paint and light do
+not change that. So a pilot that has learnt by it in one forest should fly in others [DF §IV].
+
 Legend
     N  trunks
     M  rays
@@ -74,6 +78,7 @@ SLOPES = (CENTRE - np.arange(PIXELS)) / FOCAL  # (84,) how far left column i loo
 BEARINGS = np.arctan(SLOPES)  # (84,) rad
 COSINES = np.cos(BEARINGS)  # (84,) depth along the optical axis for each metre along a ray
 ROWS = np.arange(PIXELS, dtype=np.uint8)[:, None]  # (84, 1)
+CAMERAS = ("grey", "disparity")  # what a pixel may say
 
 
 @dataclass(frozen=True)
@@ -87,7 +92,9 @@ class Scene:
     beacon_height: float = 20.0  # m
     beacon_radius: float = 1.0  # m
     beacon_pixels: float = 3.0  # px, never drawn narrower than this
-    sky: int = 90
+    camera: str = "grey"  # of CAMERAS: a grey level, or the disparity of a stereo camera
+    near: float = 2.0  # m, disparity is 255 from here on: the nearest ground stands 2.02 m away
+    sky: int = 90  # grey levels from here on
     ground: int = 60
     trunk_facing: int = 35  # bark seen head-on
     trunk_grazing: int = 0  # bark seen edge-on, darker, so that a trunk looks round
@@ -136,16 +143,35 @@ def fade(grey: ndarray, distance: ndarray, scene: Scene) -> ndarray:
 @cache
 def backdrop(scene: Scene) -> ndarray:
     """Sky above the horizon, and ground that fades towards it, as one column (84, 1) uint8.
+    Or their disparity.
 
     A row below the horizon, of slope -t, sees the ground at depth altitude / t.
     """
     depth = np.where(SLOPES < 0, scene.altitude / np.abs(SLOPES), np.inf)  # (84,) m
+    if scene.camera == "disparity":
+        return disparity(depth, scene)[:, None]
     return fade(np.float64(scene.ground), depth, scene).astype(np.uint8)[:, None]
 
 
-def silhouette(distance: ndarray, height: float, scene: Scene) -> ndarray:
-    """Pixels (84, E * 84) bool that walls of this height cover, at distance (E * 84,) m."""
-    depth = (distance.reshape(-1, PIXELS) * COSINES).ravel()  # (E * 84,) m
+def along_axis(distance: ndarray) -> ndarray:
+    """The depth of what rays meet: (E * 84,) m, from the distance along each ray (E * 84,) m."""
+    return (distance.reshape(-1, PIXELS) * COSINES).ravel()
+
+
+def disparity(depth: ndarray, scene: Scene) -> ndarray:
+    """What a stereo camera says of depths in m: 255 at `near`, half of that at twice the depth.
+
+    Two cameras side by side see a point in columns that differ by focal length * baseline / depth.
+    This difference is the disparity. It knows no colour and no light [DF §IV].
+
+    >>> disparity(np.array([1.0, 2.0, 4.0, np.inf]), Scene())
+    array([255, 255, 127,   0], dtype=uint8)
+    """
+    return np.minimum(255 * scene.near / depth, 255).astype(np.uint8)
+
+
+def silhouette(depth: ndarray, height: float, scene: Scene) -> ndarray:
+    """Pixels (84, E * 84) bool that walls of this height cover, at depth (E * 84,) m."""
     above = np.array([[height - scene.altitude], [-scene.altitude]])  # (2, 1) m, top and foot
     # A ray that hits nothing has depth inf. Top and foot are then both 42, and nothing is between.
     rows = np.ceil(CENTRE - FOCAL * above / depth)  # (2, E * 84)
@@ -172,16 +198,19 @@ def camera(
     distance, facing = raycast(
         body[near], scene.trunk_radius, BEARINGS, eye[near], eyes
     )  # (E * 84,)
+    depth, stereo = along_axis(distance), scene.camera == "disparity"  # (E * 84,) m
     bark = scene.trunk_grazing + (scene.trunk_facing - scene.trunk_grazing) * facing  # (E * 84,)
-    trunk = silhouette(distance, scene.trunk_height, scene)  # (84, E * 84)
     grey = fade(bark, distance, scene).astype(np.uint8)  # (E * 84,)
-    frames = trunk * grey + ~trunk * backdrop(scene)  # (84, E * 84) uint8: bark, or what is behind
+    value = disparity(depth, scene) if stereo else grey  # (E * 84,) of bark pixels
+    trunk = silhouette(depth, scene.trunk_height, scene)  # (84, E * 84)
+    frames = trunk * value + ~trunk * backdrop(scene)  # (84, E * 84) uint8: bark, or what is behind
     if beacon is not None:
         goal = np.concatenate([seen_from(pose, np.array([beacon])) for pose in poses])  # (E, 2) m
         to_pole = pole_distance(goal, scene)  # (E * 84,) m
-        pole = silhouette(to_pole, scene.beacon_height, scene)  # (84, E * 84)
+        pole = silhouette(along_axis(to_pole), scene.beacon_height, scene)  # (84, E * 84)
         hidden = trunk & (distance < to_pole)  # (84, E * 84) by a nearer trunk
-        frames[pole & ~hidden] = scene.beacon_grey
+        value = disparity(along_axis(to_pole), scene) if stereo else scene.beacon_grey
+        np.copyto(frames, value, where=pole & ~hidden)
     frames = frames.reshape(PIXELS, eyes, PIXELS)  # (84, E, 84) row, eye, column
     return np.ascontiguousarray(frames.swapaxes(0, 1))  # (E, 84, 84)
 

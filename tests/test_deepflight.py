@@ -138,9 +138,9 @@ def test_every_piece_that_is_not_in_the_textbook_has_one_setting_that_switches_i
     configure(off)  # all of them at once are a legal training: plain DQN
 
 
-def test_there_are_31_settings_and_each_is_a_flag(capsys: pytest.CaptureFixture) -> None:
+def test_there_are_32_settings_and_each_is_a_flag(capsys: pytest.CaptureFixture) -> None:
     settings = [f.name for f in deepflight.SETTINGS]
-    assert len(settings) == len({*settings}) == 31
+    assert len(settings) == len({*settings}) == 32
     with pytest.raises(SystemExit):
         deepflight.parse(["train", "--help"])
     text = capsys.readouterr().out
@@ -166,14 +166,14 @@ def test_what_the_learner_is_paid_by_hand() -> None:
 
 
 def test_a_metre_ahead_is_paid_to_the_learner_and_not_in_the_report() -> None:
-    fleet, paid = Fleet(WORLD, 1, camera=False), []
+    fleet, paid = Fleet(WORLD, 1, blind=True), []
     fleet.reset([0], [0])
     for a in (4, 8, 8, 8, 0):
         _, r, _, _, infos = fleet.step([a])
         paid.append(learner_reward(r, infos, RunConfig(), 0.99)[0] - r[0])
     headings = 0.07 * np.array([0, 1, 2, 3, 2])  # rad: 0.7 rad/s for 0.1 s each
     assert paid == pytest.approx(2 * 0.5 * np.cos(headings))
-    rewards = [r for _, r, *_ in refly(0, "48880", WORLD, camera=False)]
+    rewards = [r for _, r, *_ in refly(0, "48880", WORLD, blind=True)]
     assert fleet.envs[0].flight()["return"] == pytest.approx(sum(rewards))
 
 
@@ -306,6 +306,10 @@ eval --out EMPTY
 eval --out text.pt
 eval --out text.pt/deeper
 eval --beacon --weights paper.pt
+eval --camera disparity --weights paper.pt
+eval --camera colour
+train --camera colour
+train --camera EMPTY
 fly
 """
 
@@ -313,17 +317,17 @@ fly
 def write_demos(folder: Path) -> None:
     """A good file of demonstrations, and others with one thing wrong."""
     folder.mkdir()
-    good = fly(straight_pilot, [0, 1], WORLD, camera=False)
+    good = fly(straight_pilot, [0, 1], WORLD, blind=True)
     files = {"good": good, "none": [], "short": [good[0] | {"actions": good[0]["actions"][:-1]}]}
     files["digit"] = [good[0] | {"actions": "9" + good[0]["actions"][1:]}]
-    arrived = fly(laser_pilot(0.99), [0], WORLD, camera=False)[0]
+    arrived = fly(laser_pilot(0.99), [0], WORLD, blind=True)[0]
     files["other"] = [arrived | {"actions": arrived["actions"][:-1] + "0"}]
     assert arrived["actions"][-1] != "0"
     files["return"] = [arrived | {"return": arrived["return"] + 1}]
     files["nan"] = [arrived | {"return": math.nan}]
     files["late"] = [good[0] | {"actions": good[0]["actions"] + "4"}]
     files["ended"] = [good[0], good[1] | {"outcome": "goal"}]
-    files["test"] = fly(straight_pilot, [deepflight.TESTS[0]], WORLD, camera=False)
+    files["test"] = fly(straight_pilot, [deepflight.TESTS[0]], WORLD, blind=True)
     files["types"] = [good[0] | {"actions": [4] * good[0]["steps"]}]
     for name, flights in files.items():
         report = {"beacon": False, "pilots": {"straight": {"flights": flights}}}
@@ -341,8 +345,8 @@ def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
     (tmp_path / "pickle.pt").write_bytes(pickle.dumps(subprocess.Popen))
     (tmp_path / "text.pt").write_text("no weights")
     (tmp_path / "runs/taken").mkdir(parents=True)
-    save_weights(tmp_path / "paper.pt", QNetwork(9), beacon=False)
-    save_weights(tmp_path / "small.pt", QNetwork(5), beacon=False)
+    save_weights(tmp_path / "paper.pt", QNetwork(9), beacon=False, camera="grey")
+    save_weights(tmp_path / "small.pt", QNetwork(5), beacon=False, camera="grey")
     (tmp_path / "runs/taken/log.csv").write_text("step")
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken/flight.gif").write_bytes(b"GIF89a, and not ours")
@@ -353,7 +357,7 @@ def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
     network = {name: x.half() for name, x in QNetwork(9).state_dict().items()}
     save(tmp_path / "bare.pt", "weights", {"network": network})
     network["head.2.bias"] = network["head.2.bias"] * torch.nan
-    save(tmp_path / "nan.pt", "weights", {"network": network, "beacon": False})
+    save(tmp_path / "nan.pt", "weights", {"network": network, "beacon": False, "camera": "grey"})
     before = sorted(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
     for line in lines:
@@ -391,7 +395,7 @@ def test_twenty_seconds_of_training_through_the_real_command_line(tmp_path: Path
     for row in rows:
         assert sum(float(row[f"test_{o}"]) for o in OUTCOMES) == pytest.approx(1)
         assert float(row["epsilon"]) == pytest.approx(1 - 0.95 * int(row["step"]) / 40_000)
-    load_weights(run / "best.pt", 9, beacon=False)
+    load_weights(run / "best.pt", 9, beacon=False, camera="grey")
     assert max(map(len, done.stdout.splitlines()[1:])) <= 60
     log = (run / "log.csv").read_bytes()
 
@@ -423,7 +427,7 @@ def test_the_shipped_pilot_beats_the_papers_180_percent(tmp_path: Path) -> None:
     pilots = json.loads((tmp_path / "paper.json").read_text())["pilots"]
     assert len(pilots["random"]["flights"]) == 2000
     for flight in pilots["dqn"]["flights"][:3] + pilots["random"]["flights"][:3]:
-        steps = list(refly(flight["seed"], flight["actions"], WORLD, camera=False))
+        steps = list(refly(flight["seed"], flight["actions"], WORLD, blind=True))
         assert len(steps) == flight["steps"] + 1
         assert steps[-1][-1]["outcome"] == flight["outcome"]
         assert steps[-1][-1]["edge"] == flight["edge"]
@@ -432,12 +436,12 @@ def test_the_shipped_pilot_beats_the_papers_180_percent(tmp_path: Path) -> None:
 
 
 def test_the_shipped_beacon_pilot_flies_in_its_own_world_only() -> None:
-    load_weights(ROOT / "weights/beacon.pt", 9, beacon=True)
+    load_weights(ROOT / "weights/beacon.pt", 9, beacon=True, camera="grey")
     with pytest.raises(ValueError, match=r"was trained with .*True"):
-        load_weights(ROOT / "weights/beacon.pt", 9, beacon=False)
+        load_weights(ROOT / "weights/beacon.pt", 9, beacon=False, camera="grey")
 
 
 def test_an_untrained_pilot_does_not(tmp_path: Path) -> None:
     torch.manual_seed(0)
-    save_weights(tmp_path / "untrained.pt", QNetwork(9), beacon=False)
+    save_weights(tmp_path / "untrained.pt", QNetwork(9), beacon=False, camera="grey")
     assert not beats_the_papers_figure(tmp_path / "untrained.pt", tmp_path)

@@ -521,7 +521,7 @@ def corridor(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("corridor")
 def test_a_training_solves_a_tiny_mdp(n_steps: int, steps: int, tmp_path: Path) -> None:
     assert train(replace(WALK, n_steps=n_steps, steps=steps), PLAIN, tmp_path) == 0
-    q = load_weights(tmp_path / "best.pt", 2, beacon=False)
+    q = load_weights(tmp_path / "best.pt", 2, beacon=False, camera="grey")
     states = np.stack([stripe(x) for x in range(4)])
     assert greedy(q, states).tolist() == [1, 1, 1, 1]
     if n_steps == 1:  # longer windows of a random walk are off-policy, so their values are lower
@@ -561,7 +561,7 @@ def test_the_target_network_is_an_old_copy_and_in_the_end_the_mean_of_the_weight
     mean = torch.stack(newest[-30:]).mean(0)
     assert torch.allclose(agent.mean.module.head[2].weight, mean, rtol=0, atol=1e-6)
     assert not torch.allclose(newest[-1], mean, rtol=0, atol=1e-4)
-    best = load_weights(tmp_path / "best.pt", 2, beacon=False).state_dict()
+    best = load_weights(tmp_path / "best.pt", 2, beacon=False, camera="grey").state_dict()
     for name, value in agent.mean.module.state_dict().items():
         assert torch.equal(best[name], value.half().float())
 
@@ -575,7 +575,7 @@ def test_where_the_copy_falls_on_the_last_update_both_networks_are_equal(tmp_pat
     assert agent.updates == 10
     assert same(agent.q, agent.q_target)
     assert same(
-        load_weights(tmp_path / "best.pt", 2, beacon=False), agent.q.half().float()
+        load_weights(tmp_path / "best.pt", 2, beacon=False, camera="grey"), agent.q.half().float()
     )  # no mean: Q flies
 
 

@@ -27,6 +27,7 @@ from env import (
     straight_pilot,
     ways,
 )
+from render import CAMERAS
 
 WORLD = World()
 CLEARING = replace(WORLD, rows=0)  # no trunks
@@ -92,7 +93,7 @@ def test_the_jitter_is_uniform() -> None:
 
 
 def test_the_scans_minimum_agrees_with_d_obs() -> None:
-    env, rng = ForestEnv(camera=False), np.random.default_rng(0)
+    env, rng = ForestEnv(blind=True), np.random.default_rng(0)
     for seed in range(30):
         env.reset(seed=seed)
         while not env.outcome:
@@ -102,7 +103,7 @@ def test_the_scans_minimum_agrees_with_d_obs() -> None:
 
 
 def test_the_scan_starts_dead_ahead_and_goes_counter_clockwise() -> None:
-    env = ForestEnv(camera=False)
+    env = ForestEnv(blind=True)
     env.reset(seed=0)
     env.trunks = np.array([[0.0, 5.0]])
     bearings, distance = env.scan()
@@ -140,7 +141,7 @@ def test_each_action_turns_at_its_yaw_rate_and_then_flies(action: int) -> None:
 def test_each_flight_has_its_outcome_and_its_edge(
     actions: list[int], outcome: str, edge: str
 ) -> None:
-    env = ForestEnv(CLEARING, camera=False)
+    env = ForestEnv(CLEARING, blind=True)
     env.reset(seed=0)
     left = iter(actions)
     while not env.outcome:
@@ -152,7 +153,7 @@ def test_each_flight_has_its_outcome_and_its_edge(
 
 
 def test_a_flight_into_a_trunk_is_a_crash() -> None:
-    env = ForestEnv(camera=False)
+    env = ForestEnv(blind=True)
     for seed in range(20):
         *_, (_, r, terminated, truncated, info) = refly(seed, straight_to_the_end(env, seed), WORLD)
         assert terminated
@@ -188,7 +189,7 @@ def test_a_flight_is_its_seed_and_its_actions() -> None:
 
 
 def test_forward_is_the_way_gained_along_x_and_adds_up_to_x() -> None:
-    env, rng = ForestEnv(CLEARING, camera=False), np.random.default_rng(1)
+    env, rng = ForestEnv(CLEARING, blind=True), np.random.default_rng(1)
     env.reset(seed=0)
     x = gained = 0.0
     while not env.outcome:  # it flies ahead, and back as well
@@ -220,7 +221,7 @@ def test_an_observation_is_the_last_four_frames_and_starts_as_one_frame_four_tim
 
 
 def test_without_a_camera_only_the_frames_are_missing() -> None:
-    seeing, blind = ForestEnv(), ForestEnv(camera=False)
+    seeing, blind = ForestEnv(), ForestEnv(blind=True)
     assert not flown(blind, [4, 5, 6])[0].any()
     assert flown(blind, [4, 5, 6])[1:] == flown(seeing, [4, 5, 6])[1:]
 
@@ -233,7 +234,7 @@ def test_step_returns_plain_python_numbers_as_gymnasium_asks() -> None:
 
 
 def test_without_a_seed_the_next_forest_is_the_next_number() -> None:
-    env = ForestEnv(camera=False)
+    env = ForestEnv(blind=True)
     env.reset(seed=41)
     env.reset()
     assert env.seed == 42
@@ -241,7 +242,7 @@ def test_without_a_seed_the_next_forest_is_the_next_number() -> None:
 
 @pytest.mark.parametrize("four", [np.array(4), np.int64(4), np.uint8(4)])
 def test_an_action_of_any_integer_type_means_what_the_int_means(four: object) -> None:
-    assert flown(ForestEnv(camera=False), [four])[1:] == flown(ForestEnv(camera=False), [4])[1:]
+    assert flown(ForestEnv(blind=True), [four])[1:] == flown(ForestEnv(blind=True), [4])[1:]
 
 
 def test_a_returned_observation_is_the_callers_own() -> None:
@@ -265,7 +266,7 @@ def test_a_returned_observation_is_the_callers_own() -> None:
 
 
 def test_after_a_reset_that_fails_no_flight_is_in_the_air() -> None:
-    env = ForestEnv(camera=False)
+    env = ForestEnv(blind=True)
     env.reset(seed=0)
     with pytest.raises(ValueError, match="seed is -1"):
         env.reset(seed=-1)
@@ -275,7 +276,7 @@ def test_after_a_reset_that_fails_no_flight_is_in_the_air() -> None:
 
 @pytest.mark.parametrize("action", [-1, 9, 0.5, 4.0, None, "4", [4], math.nan, True, np.True_])
 def test_an_impossible_action_is_named(action: object) -> None:
-    env = ForestEnv(camera=False)
+    env = ForestEnv(blind=True)
     env.reset(seed=0)
     with pytest.raises(ValueError, match="allowed are whole numbers from 0 to 8"):
         env.step(action)
@@ -284,7 +285,7 @@ def test_an_impossible_action_is_named(action: object) -> None:
 @pytest.mark.parametrize("seed", [-1, 0.5, "7", [1], True, 10**30 + 0.5])
 def test_an_impossible_seed_is_named(seed: object) -> None:
     with pytest.raises(ValueError, match="allowed are whole numbers from 0"):
-        ForestEnv(camera=False).reset(seed=seed)
+        ForestEnv(blind=True).reset(seed=seed)
 
 
 def test_seeds_of_any_size_plant_a_forest() -> None:
@@ -296,7 +297,7 @@ def test_a_world_takes_numpys_numbers() -> None:
 
 
 def test_a_flight_that_is_over_or_not_begun_cannot_go_on() -> None:
-    env = ForestEnv(camera=False)
+    env = ForestEnv(blind=True)
     with pytest.raises(ValueError, match="reset"):
         env.step(4)
     straight_to_the_end(env, 0)
@@ -398,7 +399,7 @@ def test_the_record_holds_the_flights_of_the_last_steps_and_they_fly_again() -> 
 
 
 def test_a_fleet_needs_an_action_for_each_drone_in_the_air() -> None:
-    fleet = Fleet(WORLD, 2, camera=False)
+    fleet = Fleet(WORLD, 2, blind=True)
     fleet.reset([0, 1], [0, 1])
     for actions in ([4], [4, 4, 4], [4, 9]):
         with pytest.raises(ValueError, match=r"zip|allowed are whole numbers from 0 to 8"):
@@ -471,7 +472,7 @@ def test_the_planner_adds_up_the_rewards_to_come_in_any_world(seed: int) -> None
         r_safe=rng.uniform(0, 1), r_precrash=-rng.uniform(1, 9), r_crash=-rng.uniform(5, 50),
         goal_radius=rng.uniform(0.5, 4), beams=60, rows=3, columns=3, first_y=-6.0,
     )  # fmt: skip
-    env, gamma = ForestEnv(world, camera=False), rng.uniform(0.8, 0.999)
+    env, gamma = ForestEnv(world, blind=True), rng.uniform(0.8, 0.999)
     env.reset(seed=seed)
     for _ in range(5):
         x, y = rng.random(2) * (world.length, world.width) - (0, world.width / 2)
@@ -481,7 +482,7 @@ def test_the_planner_adds_up_the_rewards_to_come_in_any_world(seed: int) -> None
 
 
 def test_in_the_open_the_planner_turns_to_the_goal() -> None:
-    env = ForestEnv(CLEARING, camera=False)
+    env = ForestEnv(CLEARING, blind=True)
     for heading, action in ((0.0, 4), (-2.0, 8), (2.0, 0)):
         env.reset(seed=0)
         env.pose = (45.0, 0.0, heading)
@@ -489,7 +490,7 @@ def test_in_the_open_the_planner_turns_to_the_goal() -> None:
 
 
 def test_the_planner_turns_away_from_a_trunk_ahead() -> None:
-    env = ForestEnv(CLEARING, camera=False)
+    env = ForestEnv(CLEARING, blind=True)
     env.reset(seed=0)
     for left in (0.3, -0.3):
         env.trunks = np.array([[6.0, left]])
@@ -505,7 +506,7 @@ def test_the_planner_sees_2_2_s_ahead_at_any_control_rate() -> None:
 
 
 def test_the_laser_pilot_arrives_and_never_crashes() -> None:
-    flights = fly(laser_pilot(GAMMA), range(2 * 10**9, 2 * 10**9 + 20), WORLD, camera=False)
+    flights = fly(laser_pilot(GAMMA), range(2 * 10**9, 2 * 10**9 + 20), WORLD, blind=True)
     assert not any(f["outcome"] == "crash" for f in flights)
     assert sum(f["outcome"] == "goal" for f in flights) >= 18
     assert sum(f["return"] for f in flights) / 20 > 70
@@ -521,19 +522,19 @@ def test_the_random_pilot_draws_its_actions_uniformly() -> None:
 
 
 def test_the_straight_pilot_flies_along_the_middle_line() -> None:
-    (flight,) = fly(straight_pilot, [0], CLEARING, camera=False)
+    (flight,) = fly(straight_pilot, [0], CLEARING, blind=True)
     assert (flight["outcome"], flight["steps"]) == ("goal", 175)  # within 3 m of x = 90 m
     assert flight["actions"] == "4" * 175
 
 
 def test_where_no_yaw_rate_is_straight_the_straight_pilot_takes_both_middle_ones_in_turn() -> None:
-    (flight,) = fly(straight_pilot, [0], replace(CLEARING, actions=4), camera=False)
+    (flight,) = fly(straight_pilot, [0], replace(CLEARING, actions=4), blind=True)
     assert (flight["outcome"], flight["actions"][:6]) == ("goal", "121212")
 
 
 def test_flights_come_in_the_order_of_their_seeds_and_as_each_flies_alone() -> None:
     seeds = [*range(130, 0, -1), 7, 7]  # more than fly at once, and one forest thrice
-    env, flights = ForestEnv(camera=False), fly(straight_pilot, seeds, WORLD, camera=False)
+    env, flights = ForestEnv(blind=True), fly(straight_pilot, seeds, WORLD, blind=True)
     assert [f["seed"] for f in flights] == seeds
     for seed, flight in zip(seeds, flights, strict=True):
         straight_to_the_end(env, seed)
@@ -599,6 +600,8 @@ WORLDS = st.builds(
     r_crash=floats(-20, 0),
     max_steps=st.integers(1, 40),
     beacon=st.booleans(),
+    camera=st.sampled_from(CAMERAS),
+    near=floats(0.1, 10),
 )
 
 

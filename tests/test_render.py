@@ -2,6 +2,7 @@
 
 import weakref
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -187,6 +188,66 @@ def test_the_beacon_is_hidden_by_nearer_trunks_and_hides_farther_ones() -> None:
     assert hidden[41, 41] == see(EYE, 0.0, before, SCENE)[41, 41]
     shown = see(EYE, 0.0, behind, SCENE, beacon=(10.0, 0.0))
     assert shown[41, 41] == SCENE.beacon_grey
+
+
+# -------------------------------------------------- disparity
+
+STEREO = Scene(camera="disparity")
+
+
+def test_disparity_halves_when_depth_doubles_and_is_cut_at_near() -> None:
+    for depth in (1.0, 2.5, 5.0, 10.0, 20.0, 39.0):
+        x = depth + 0.5  # m, the trunk's middle, dead ahead
+        value = see(EYE, 0.0, np.array([[x, 0.0]]), STEREO)[41, 41]
+        # column 41 looks along y = t * z, and meets the circle where (z - x)^2 + (t * z)^2 = 0.25
+        t = 0.5 / 42
+        z = (x - np.sqrt(0.25 * (1 + t * t) - (t * x) ** 2)) / (1 + t * t)
+        assert value == int(min(255 * 2 / z, 255))
+
+
+def test_all_of_an_upright_wall_in_one_column_has_one_disparity_by_depth_and_not_by_distance() -> (
+    None
+):
+    side = see(EYE, 0.0, np.array([[10.0, 8.0]]), STEREO)  # far off the axis
+    columns = (side != backdrop(STEREO))[:42].any(0).nonzero()[0]
+    for i in columns[1:-1]:
+        distance, _ = raycast(np.array([[10.0, 8.0]]), 0.5, BEARINGS[i : i + 1])
+        depth = distance[0] * np.cos(BEARINGS[i])
+        rows = side[:42, i] > 0  # above the horizon there is nothing else
+        assert set(side[:42, i][rows]) == {int(255 * 2 / depth)}
+
+
+def test_the_grounds_disparity_rises_in_a_straight_line_from_the_horizon_down() -> None:
+    ground = see(EYE, 0.0, np.empty((0, 2)), STEREO)[:, 0]
+    assert (ground[:42] == 0).all(), "the sky is infinitely far"
+    for row in range(42, 84):  # depth = altitude * 42 / (row - 41.5), by similar triangles
+        assert ground[row] == int(255 * STEREO.near * (row - 41.5) / (42 * STEREO.altitude))
+    assert 250 <= ground[83] < 255, "so none of it is cut"
+
+
+def test_disparity_knows_no_colour() -> None:
+    trunks, pole = random_trunks(np.random.default_rng(4)), (15.0, 2.0)
+    colours = {"sky": 200, "ground": 10, "trunk_facing": 90, "trunk_grazing": 250}
+    other = replace(STEREO, beacon_grey=7, **colours)
+    assert (see(EYE, 0.0, trunks, STEREO, pole) == see(EYE, 0.0, trunks, other, pole)).all()
+
+
+def test_both_cameras_see_the_same_silhouettes() -> None:
+    # without haze, and with bark that neither sky nor ground resembles
+    plain = Scene(view=1e4, sky=0, ground=0, trunk_facing=200, trunk_grazing=200, beacon_grey=255)
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        trunks, pole = random_trunks(rng, 10), (30.0, rng.uniform(-20, 20))
+        grey = see(EYE, 0.0, trunks, plain, pole)
+        stereo = see(EYE, 0.0, trunks, replace(plain, camera="disparity"), pole)
+        assert ((grey > 0)[:42] == (stereo > 0)[:42]).all()
+
+
+def test_the_pole_has_its_own_disparity_and_nearer_trunks_hide_it() -> None:
+    pole = (20.0, 0.0)
+    alone = see(EYE, 0.0, np.empty((0, 2)), STEREO, pole)
+    assert alone[20, 41] == int(255 * 2 / 19), "its bark is one radius nearer than its middle"
+    assert see(EYE, 0.0, np.array([[6.0, 0.0]]), STEREO, pole)[41, 41] == int(255 * 2 / 5.5)
 
 
 # -------------------------------------------------- many eyes at once

@@ -158,14 +158,17 @@ def test_ten_times_taken_up_again_is_never_interrupted(tmp_path: Path, watched: 
         assert np.array_equal(getattr(whole.replay, name), getattr(cut.replay, name)), name
 
 
-def test_with_a_teacher_and_demonstrations_too(tmp_path: Path, watched: None) -> None:
-    flights = fly(laser_pilot(0.99), [0, 1], World(), camera=False)
+def test_with_a_teacher_demonstrations_and_disparity_too(tmp_path: Path, watched: None) -> None:
+    flights = fly(laser_pilot(0.99), [0, 1], World(), blind=True)
     demos = [(f["seed"], f["actions"]) for f in flights]
     told = {"teacher": True, "demo_updates": 3, "steps": 480, "test_every": 160}
+    told |= {"camera": "disparity"}
     whole = train_with_cuts(tmp_path / "whole", set(), demos, **told)
     cut = train_with_cuts(tmp_path / "cut", {8, 200, 408}, demos, **told)
     assert_same_training(tmp_path / "whole", tmp_path / "cut")
     assert np.array_equal(whole.replay.scores, cut.replay.scores)
+    assert np.array_equal(whole.replay.frames, cut.replay.frames)
+    assert (whole.replay.frames[:, :, 0] == 0).mean() > 0.5, "the sky has no disparity"
     assert whole.replay.scores.any(2).all()
     assert load(tmp_path / "cut" / CHECKPOINT, "checkpoint")["demos"] == demos
     first = (tmp_path / "whole/log.csv").read_text().splitlines()[1].split(",")
@@ -175,7 +178,7 @@ def test_with_a_teacher_and_demonstrations_too(tmp_path: Path, watched: None) ->
 def test_where_q_would_explore_the_teacher_flies(tmp_path: Path, watched: None) -> None:
     c, r = configure(TEACHER | SMALL | {"teacher": True, "epsilon_final": 1.0, "steps": 240})
     train(c, r, tmp_path)
-    fleet, alone = Watched.runs[-1].fleet, Fleet(World(), 1, camera=False)
+    fleet, alone = Watched.runs[-1].fleet, Fleet(World(), 1, blind=True)
     for lane in (0, 1):
         seed, actions = fleet.records[lane][0]
         assert len(actions) == 240 // 8
@@ -541,13 +544,14 @@ def weights_are_refused_or_the_same(path: Path, q: QNetwork, trials: int) -> Non
     """Write spoilt weights; what is not refused in one line has every weight as it was."""
     rng = np.random.default_rng(trials)
     for _ in range(trials):
-        content = {"network": {k: x.half() for k, x in q.state_dict().items()}, "beacon": False}
+        content = {"network": {k: x.half() for k, x in q.state_dict().items()}}
+        content |= {"beacon": False, "camera": "grey"}
         content = spoil({"kind": "weights"} | content, rng)
         buffer = io.BytesIO()
         torch.save(content, buffer)
         path.write_bytes(buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
         try:
-            read = load_weights(path, 9, beacon=False).state_dict()
+            read = load_weights(path, 9, beacon=False, camera="grey").state_dict()
         except ValueError as error:
             assert "\n" not in str(error)
             continue

@@ -141,7 +141,7 @@ def train(c: DQNConfig, r: RunConfig, runners: int, out: Path) -> None:
         print(f"{text}, flights of {flown.get('episode_len_mean', 0):.1f} steps", flush=True)
     report(nodes, busy, live)
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_weights(out, network(algorithm), beacon=r.beacon)
+    save_weights(out, network(algorithm), beacon=r.beacon, camera=r.camera)
     algorithm.stop()
     print(f"wrote {out}; fly it: deepflight.py eval{' --beacon' * r.beacon} --weights {out}")
 

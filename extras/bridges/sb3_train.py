@@ -7,7 +7,7 @@
 The environment, the network, the batch, the ratio of updates to steps and the schedules are those
 of dqn.DQNConfig; the optimizer is Adam with our epsilon. What Stable-Baselines3 does not have,
 the training goes without: Double DQN, mirroring, our additions to the reward, bfloat16, averaged
-weights, and the late change of Huber's delta. It keeps s and s2 whole, 56.4 kB a transition, so the
+weights, and our wider loss. It keeps s and s2 whole, 56.4 kB a transition, so the
 replay here is 50,000 transitions, 2.8 GB, a quarter of ours.
 
 Every hundred flights it prints their mean return and length. Every 5,000 steps it flies 24 forests
@@ -98,7 +98,7 @@ def train(c: DQNConfig, r: RunConfig, out: Path) -> int:
     except KeyboardInterrupt:
         end, code = f"\ninterrupted at step {model.num_timesteps:,}; ", 130
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_weights(out, convert(model), beacon=r.beacon)
+    save_weights(out, convert(model), beacon=r.beacon, camera=r.camera)
     fly = ["deepflight.py", "eval", *["--beacon"] * r.beacon, "--weights", str(out)]
     say(f"{end}wrote {out}; fly it: python {shlex.join(fly)}")
     return code

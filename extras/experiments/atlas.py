@@ -69,7 +69,7 @@ def pilot(name: str) -> Pilot:
         return random_pilot(np.random.default_rng(0))
     beacon = name.endswith("beacon")
     file = ROOT / f"weights/{'beacon' if beacon else 'paper'}.pt"
-    return dqn_pilot(load_weights(file, World.actions, beacon=beacon))
+    return dqn_pilot(load_weights(file, World.actions, beacon=beacon, camera="grey"))
 
 
 def flights(job: tuple[str, float, float, int]) -> Flights:
@@ -78,7 +78,7 @@ def flights(job: tuple[str, float, float, int]) -> Flights:
     torch.set_num_threads(1)
     seeds = range(EVAL_FIRST, EVAL_FIRST + count)
     world = forest(density, speed, name.endswith("beacon"))
-    return fly(pilot(name), seeds, world, camera=name.startswith("camera"))
+    return fly(pilot(name), seeds, world, blind=not name.startswith("camera"))
 
 
 def doomed(env: ForestEnv, action: int) -> bool:
@@ -92,7 +92,7 @@ def doomed(env: ForestEnv, action: int) -> bool:
 
 def at(flight: dict, world: World, steps: int) -> ForestEnv:
     """The flight, flown again that far."""
-    env = ForestEnv(world, camera=False)
+    env = ForestEnv(world, blind=True)
     env.reset(seed=flight["seed"])
     for action in flight["actions"][:steps]:
         env.step(int(action))

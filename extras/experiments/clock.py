@@ -66,7 +66,8 @@ def train(asked: Question, seed: int, folder: Path) -> list[float]:
 def flown(path: Path, figure: str) -> float:
     """What these weights reach in forests that chose nothing."""
     rng, world = np.random.default_rng(0), World()
-    q, bar = load_weights(path, World.actions, beacon=False), fly_random(FORESTS, world, rng)
+    q = load_weights(path, World.actions, beacon=False, camera="grey")
+    bar = fly_random(FORESTS, world, rng)
     draws = rng.integers(len(FORESTS), size=(1, len(FORESTS)))
     return summarize(fly(dqn_pilot(q), FORESTS, world), bar, draws)[figure]["value"]
 

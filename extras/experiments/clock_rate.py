@@ -33,7 +33,7 @@ def fly_at(rate: int) -> dict[str, dict]:
     bar = fly_random(SEEDS, world, rng)
     gamma = DQNConfig.gamma ** (1 / rate / World.dt)  # the same discount a second
     pilots = {"straight": straight_pilot, "laser": laser_pilot(gamma)}
-    flights = {name: fly(pilots[name], SEEDS, world, camera=False) for name in pilots}
+    flights = {name: fly(pilots[name], SEEDS, world, blind=True) for name in pilots}
     draws = rng.integers(len(SEEDS), size=(2000, len(SEEDS)))  # (2000, forests)
     return {name: summarize(x, bar, draws) for name, x in ({"random": bar} | flights).items()}
 

@@ -96,7 +96,7 @@ def crossed(fold: int) -> float:
             actions.append(int(worth.argmax()))
         return actions
 
-    flights = fly(pilot, range(EVAL_FIRST, EVAL_FIRST + FLIGHTS), WORLD, camera=False)
+    flights = fly(pilot, range(EVAL_FIRST, EVAL_FIRST + FLIGHTS), WORLD, blind=True)
     return float(100 * measure(flights)["crossed"].mean())
 
 

@@ -33,7 +33,7 @@ FORESTS = 10
 def frames(beacon: bool, forests: int) -> Tensor:
     """The states (N, 4, 84, 84) uint8 of the laser's flights."""
     world, seeds = World(beacon=beacon), range(EVAL_FIRST, EVAL_FIRST + forests)
-    flights = fly(laser_pilot(DQNConfig.gamma), seeds, world, camera=False)
+    flights = fly(laser_pilot(DQNConfig.gamma), seeds, world, blind=True)
     states = [s for f in flights for s, *_ in refly(f["seed"], f["actions"], world)]
     return torch.from_numpy(np.stack(states))
 
@@ -53,7 +53,7 @@ def count(q: QNetwork, s: Tensor) -> dict[str, str]:
 def examine(path: Path, forests: int = FORESTS) -> dict[str, bool | str]:
     """A weights file: its beacon flag, and the count in the world of that flag."""
     beacon = load(path, "weights")["beacon"]
-    q = load_weights(path, World.actions, beacon=beacon)
+    q = load_weights(path, World.actions, beacon=beacon, camera="grey")
     return {"beacon": beacon} | count(q, frames(beacon, forests))
 
 

@@ -64,7 +64,7 @@ def trainings() -> Iterator[tuple[str, str, int, list[str]]]:
 
 def demonstrate(count: int) -> Flights:
     """The first flights of the laser pilot."""
-    return fly(laser_pilot(DQNConfig.gamma), range(count), World(), camera=False)
+    return fly(laser_pilot(DQNConfig.gamma), range(count), World(), blind=True)
 
 
 def train_all() -> None:
@@ -99,12 +99,12 @@ def fly_all() -> None:
     world = World()
     if "the teacher itself" not in flown():
         pilot = laser_pilot(DQNConfig.gamma)
-        note("the teacher itself", 0, fly(pilot, FORESTS, world, camera=False))
+        note("the teacher itself", 0, fly(pilot, FORESTS, world, blind=True))
     for name, label, seed, _ in trainings():
         folder, kept = ROOT / "runs" / name, ROOT / "results" / name.replace("-", "/", 1)
         if str(seed) in flown().get(label, {}) or not finished(folder):
             continue
-        q = load_weights(folder / "best.pt", World.actions, beacon=False)
+        q = load_weights(folder / "best.pt", World.actions, beacon=False, camera="grey")
         note(label, seed, fly(dqn_pilot(q), FORESTS, world))
         kept.mkdir(parents=True, exist_ok=True)
         for file in ("log.csv", "config.json"):

@@ -118,7 +118,7 @@ def main() -> None:
     draw_crossed()
     report = json.loads((ROOT / "results/eval.json").read_text())
     flights = {name: pilot["flights"] for name, pilot in report["pilots"].items()}
-    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False)
+    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False, camera="grey")
     first = int(measure(flights["dqn"])["crossed"].argmax())  # to cross
     pictures = film({name: flown[first] for name, flown in flights.items()}, World(), q)
     save_film(ROOT / "figures/flight.gif", pictures, round(1000 * World.dt))

@@ -131,9 +131,11 @@ def networks(folder: Path) -> dict[str, QNetwork]:
     """What best.pt keeps, and the newest network, which also goes to last.pt."""
     saved, q = load(folder / "checkpoint.pt", "checkpoint")["agent"], QNetwork(World.actions)
     q.load_state_dict({key: saved["q." + key] for key in q.state_dict()})
-    save_weights(folder / "last.pt", q, beacon=False)
-    files = {name: folder / f"{name}.pt" for name in ("best", "last")}
-    return {name: load_weights(path, World.actions, beacon=False) for name, path in files.items()}
+    save_weights(folder / "last.pt", q, beacon=False, camera="grey")
+    return {
+        name: load_weights(folder / f"{name}.pt", World.actions, beacon=False, camera="grey")
+        for name in ("best", "last")
+    }
 
 
 def fly_all() -> None:

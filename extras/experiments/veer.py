@@ -87,7 +87,7 @@ def show(x: dict[str, float] | None) -> str:
 def main() -> None:
     """Fly both pilots, print the table, write it."""
     torch.set_num_threads(2)
-    q = load_weights(ROOT / "weights/paper.pt", WORLD.actions, beacon=False)
+    q = load_weights(ROOT / "weights/paper.pt", WORLD.actions, beacon=False, camera="grey")
     pilots = {
         "random": random_pilot(np.random.default_rng(0)),
         "dqn": deepflight.dqn_pilot(q),

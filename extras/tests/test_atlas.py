@@ -19,6 +19,6 @@ def test_trunks_grow_in_number_with_density_on_the_same_ground(density: float) -
 
 
 def test_who_flies_straight_into_a_trunk_has_seen_it_and_could_have_turned() -> None:
-    for flight in fly(straight_pilot, range(10), World(), camera=False):
+    for flight in fly(straight_pilot, range(10), World(), blind=True):
         assert flight["outcome"] == "crash"
         assert cause(flight, World()) in ("careless", "trapped")

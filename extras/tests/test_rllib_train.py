@@ -29,7 +29,8 @@ def test_two_runners_train_a_network_that_flies(tmp_path: Path) -> None:
         train(DQNConfig(steps=1000), RunConfig(), runners=2, out=other)
     finally:
         ray.shutdown()
-    saved = (load_weights(path, World.actions, beacon=False) for path in (out, other))
+    world = {"beacon": False, "camera": "grey"}
+    saved = (load_weights(path, World.actions, **world) for path in (out, other))
     trained, untrained = (q.state_dict() for q in saved)
     assert not torch.equal(trained["head.2.bias"], untrained["head.2.bias"]), "it learnt nothing"
     fly = ["eval", "--weights", str(out), "--episodes", "2", "--pilots", "dqn"]
@@ -45,7 +46,7 @@ def test_a_training_on_three_nodes_outlives_one_of_them(tmp_path: Path) -> None:
     flown = [number(line[1]) for line in added]
     assert len(flown) == 3 and sum(flown) == steps[-1], "a step is counted nowhere, or twice"
     assert [number(line[1]) for line in added if line[3]] == [min(flown)], "one node was lost"
-    assert load_weights(out, World.actions, beacon=False)
+    assert load_weights(out, World.actions, beacon=False, camera="grey")
     pilot = ["eval", "--weights", str(out), "--episodes", "2", "--pilots", "dqn"]
     command = [sys.executable, "deepflight.py", *pilot, "--out", str(tmp_path)]
     subprocess.run(command, cwd=ROOT, check=True)

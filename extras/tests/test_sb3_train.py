@@ -84,7 +84,7 @@ def test_the_converted_network_has_the_trained_ones_values_and_flies(tmp_path: P
         ours = q(torch.from_numpy(s))  # (50, 9)
     assert torch.allclose(ours, theirs, rtol=1e-5, atol=1e-5)
     assert np.array_equal(model.predict(s, deterministic=True)[0], ours.argmax(1))
-    save_weights(tmp_path / "sb3.pt", q, beacon=False)
+    save_weights(tmp_path / "sb3.pt", q, beacon=False, camera="grey")
     fly = ["eval", "--weights", str(tmp_path / "sb3.pt"), "--episodes", "2", "--pilots", "dqn"]
     assert deepflight.main([*fly, "--out", str(tmp_path)]) == 0
 
@@ -150,7 +150,7 @@ def test_a_bad_command_line_gets_one_line_and_nothing_is_written(
 
 def test_weights_may_be_replaced_and_new_folders_named(tmp_path: Path) -> None:
     old, new = tmp_path / "old.pt", tmp_path / "a" / "b" / "new.pt"
-    save_weights(old, QNetwork(9), beacon=False)
+    save_weights(old, QNetwork(9), beacon=False, camera="grey")
     for path in (old, new):
         check_output(path, b"PK.*weights")
     assert list(tmp_path.iterdir()) == [old]
@@ -168,11 +168,11 @@ def test_ctrl_c_saves_the_weights_so_far(tmp_path: Path) -> None:
     assert training.returncode == 130 and shown
     assert "Traceback" not in errors
     assert re.match(r"interrupted at step [\d,]+; wrote \S+; fly it: ", rest.splitlines()[-1])
-    load_weights(out, World.actions, beacon=False)
+    load_weights(out, World.actions, beacon=False, camera="grey")
 
 
 @pytest.mark.long
 def test_a_whole_training_by_the_command_line_writes_weights(tmp_path: Path) -> None:
     out = tmp_path / "sb3.pt"
     assert main(["--steps", "5100", "--beacon", "--out", str(out)]) == 0
-    load_weights(out, World.actions, beacon=True)
+    load_weights(out, World.actions, beacon=True, camera="grey")
