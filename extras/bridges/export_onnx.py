@@ -2,11 +2,27 @@
 
     extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.bridges.export_onnx      # weights/paper.pt -> runs/paper.onnx
+    extras/.venv/bin/python -m extras.bridges.export_onnx --camera disparity
 
 Input `observation` (B, 4, 84, 84) uint8, output `q` (B, 9) float32, any B; the action is the
 argmax. The script then flies forests from the first evaluation seed on, half of them at random, and
 holds the export against torch on 1,000 of the states met; last it times a single decision in both,
 on one thread. A control step lasts 100 ms. What it times is this machine's processor, not a Jetson.
+onnxruntime 1.17, which a Jetson has, reads opset 20 and IR version 9 at most. The export has less.
+
+What a stereo camera must deliver to the disparity pilot, ten times a second:
+
+    size     84x84 pixels of one byte; the four last pictures, the oldest first, 0.1 s apart
+    view     90 degrees wide and high: cut the middle square out of a wider picture. The lens looks
+             level and straight ahead, from 2 m above the ground, at 5 m/s: turn the picture back by
+             the drone's roll and pitch first
+    value    510 / depth, cut at 255 and rounded down; depth in m along the lens's axis. A pair with
+             focal length f px and baseline b m that measures d px has depth f * b / d. So write
+             510 * d / (f * b)
+    near     2 m: all that is nearer is 255
+    far      0 for the sky, and for all that is farther than the pair can tell
+    holes    the value to their left. Not 0: that says that the way is free (results/README.md has
+             what both cost)
 """
 
 import argparse
@@ -25,6 +41,7 @@ from numpy import ndarray
 from deepflight import EVAL_FIRST
 from dqn import QNetwork, greedy, load_weights
 from env import ForestEnv, World
+from render import CAMERAS
 
 ROOT, STATES = Path(__file__).parents[2], 1000
 WARMUP, CALLS = 50, 1000  # decisions before and in a timing
@@ -39,11 +56,13 @@ def export(q: QNetwork, path: Path) -> None:
             q.eval(),
             (torch.zeros(2, 4, 84, 84, dtype=torch.uint8),),
             dynamo=True,
+            opset_version=18,
             verbose=False,
             input_names=["observation"],
             output_names=["q"],
             dynamic_shapes=({0: torch.export.Dim("batch")},),
         )
+    program.model.ir_version = 9  # the newest that onnxruntime 1.17 reads, on a Jetson
     path.parent.mkdir(parents=True, exist_ok=True)
     program.save(path, external_data=False)
 
@@ -93,16 +112,18 @@ def latency(decide: Callable[[ndarray], object], s: ndarray) -> dict[str, float]
 def main() -> None:
     """Export, compare, time."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--weights", type=Path, help="default: weights/paper.pt or beacon.pt")
+    parser.add_argument("--weights", type=Path, help="default: the shipped ones of this world")
     parser.add_argument("--beacon", action="store_true", help="the world with the visible goal")
+    parser.add_argument("--camera", choices=CAMERAS, default="grey", help="what its pictures say")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    shipped = ROOT / f"weights/{'beacon' if args.beacon else 'paper'}.pt"
-    weights = args.weights or shipped
-    q = load_weights(weights, World.actions, beacon=args.beacon)
+    world = World(beacon=args.beacon, camera=args.camera)
+    name = "beacon" if args.beacon else "paper" if args.camera == "grey" else args.camera
+    weights = args.weights or ROOT / f"weights/{name}.pt"
+    q = load_weights(weights, World.actions, beacon=args.beacon, camera=args.camera)
     path = Path("runs") / f"{weights.stem}.onnx"
     export(q, path)
-    run, s = session(path), states(q, World(beacon=args.beacon), STATES)
+    run, s = session(path), states(q, world, STATES)
     report = parity(q, run, s)
     report["onnxruntime, ms"] = latency(lambda one: run.run(None, {"observation": one}), s)
     report["torch, ms"] = latency(lambda one: greedy(q, one), s)

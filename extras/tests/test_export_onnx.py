@@ -3,23 +3,31 @@
 from pathlib import Path
 
 import numpy as np
+import onnx
 import torch
 
-from dqn import greedy, load_weights
+from dqn import QNetwork, greedy, load_weights
 from env import World
 from extras.bridges.export_onnx import ROOT, STATES, export, parity, session, states
 
 
 def test_on_a_thousand_states_the_export_gives_torch_s_values_and_actions(tmp_path: Path) -> None:
-    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False)
+    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False, camera="grey")
     export(q, tmp_path / "paper.onnx")
     report = parity(q, session(tmp_path / "paper.onnx"), states(q, World(), STATES))
     assert report["relative error"] <= 1e-4
     assert report["same action"] >= 0.999
 
 
+def test_onnxruntime_1_17_can_read_the_export(tmp_path: Path) -> None:
+    export(QNetwork(9), tmp_path / "new.onnx")
+    model = onnx.load(tmp_path / "new.onnx")
+    assert model.ir_version <= 9
+    assert [x.version for x in model.opset_import if not x.domain] <= [20]
+
+
 def test_parity_sees_another_network(tmp_path: Path) -> None:
-    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False)
+    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False, camera="grey")
     export(q, tmp_path / "paper.onnx")
     with torch.no_grad():
         q.head[2].bias[0] += 1
@@ -28,7 +36,7 @@ def test_parity_sees_another_network(tmp_path: Path) -> None:
 
 
 def test_any_batch_will_do(tmp_path: Path) -> None:
-    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False)
+    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False, camera="grey")
     export(q, tmp_path / "paper.onnx")
     run = session(tmp_path / "paper.onnx")
     for size in (1, 7):
