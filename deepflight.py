@@ -318,8 +318,9 @@ FLAGS = {"demos": DEMOS, "teacher": TEACHER, "beacon": BEACON}
 #     python deepflight.py eval --pilots laser --first-seed 0 --episodes 32 --json demos.json
 # Somebody took action a in state s, and that is all that a flight says. So Q(s, a) should be the
 # greatest of the nine, by a margin (dqn.margin_loss) [Hester 2018]. The network learns from these
-# flights alone at first. Later a quarter of each batch is theirs. Their rewards count like others.
-# As measured in results/README.md, that quarter does harm: `--demo-share 0` leaves it out.
+# flights alone at first. Their rewards count like others. With `--demo-share 0.25` a quarter of
+# each later batch is theirs too. Then `--epsilon-decay 40000` is needed, so that the drone explores
+# as usual: demonstrated flights do not crash, and Q sees a crash coming only if it has seen many.
 
 
 def teach(fleet: Fleet, c: DQNConfig, rc: RunConfig) -> ndarray | float:

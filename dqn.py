@@ -184,7 +184,7 @@ class DQNConfig:
     )
     bellman: bool = setting(True, "TD targets; --no-bellman: from the teacher alone", 0, 1)
     demo_updates: int = setting(2_000, "updates on --demos alone, before all others", 1)
-    demo_share: float = setting(0.25, "share of --demos in every later batch; 0: none", 0, 1)
+    demo_share: float = setting(0.0, "share of --demos in every later batch; 0: none", 0, 1)
     margin: float = setting(5.0, "by which a demonstrated action must be the best", 0, 1e3)
     bfloat16: bool = setting(True, "[+] quick convolutions if the CPU has it; --no-bfloat16", 0, 1)
 

@@ -162,7 +162,7 @@ def test_with_a_teacher_demonstrations_and_disparity_too(tmp_path: Path, watched
     flights = fly(laser_pilot(0.99), [0, 1], World(), blind=True)
     demos = [(f["seed"], f["actions"]) for f in flights]
     told = {"teacher": True, "demo_updates": 3, "steps": 480, "test_every": 160}
-    told |= {"camera": "disparity"}
+    told |= {"camera": "disparity", "demo_share": 0.25}
     whole = train_with_cuts(tmp_path / "whole", set(), demos, **told)
     cut = train_with_cuts(tmp_path / "cut", {8, 200, 408}, demos, **told)
     assert_same_training(tmp_path / "whole", tmp_path / "cut")

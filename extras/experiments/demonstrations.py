@@ -37,10 +37,13 @@ STEPS, SEEDS, SHOWN, COUNTS = 60_000, (0, 1), 32, (8, 32, 128, 512)
 DEMO_FILE, RESULT = ROOT / "runs/demos.json", ROOT / "results/demonstrations.json"
 KINDS = {  # label -> flags
     "from scratch": [],
-    "demonstrations before": ["--demos", str(DEMO_FILE), "--demo-share", "0"],
-    "before and during": ["--demos", str(DEMO_FILE)],
+    "demonstrations before": ["--demos", str(DEMO_FILE)],
+    "before and during": ["--demos", str(DEMO_FILE), "--demo-share", "0.25"],
     "teacher in the loop": ["--teacher", "--bellman"],
     "imitation alone": ["--teacher"],
+    "before and during, exploring": [
+        *("--demos", str(DEMO_FILE), "--demo-share", "0.25", "--epsilon-decay", "40000")
+    ],
 }
 PANELS = {  # figure -> title, factor
     "over_random": ("flight time over random, %", 100),
