@@ -1,24 +1,33 @@
 "use strict";
 // The page of the cockpit. It shows what the server answers, and knows no rule of the world.
-// A moment is one entry of flight.moments: pose, reward, return, d_obs, q, and a picture.
+// A flight has moments; each has pose, reward, return, d_obs, q, and a picture.
 
 const $ = (id) => document.getElementById(id);
-const SVG = "http://www.w3.org/2000/svg";
 const PIXELS = 84;
-
-let options; // what one may choose from
-let chosen = {}; // world, weights, seed, pilot: what is chosen
-let flight = null; // the flight on show: {moments, trunks, actions, ended, record}
-let ghost = null; // another flight through the same forest: the same, and a label
+let options; // what one may choose from, and the numbers of each world
+let chosen = {}; // world, weights, seed, pilot
+let flight = null; // the flight on show: moments, record, actions, ended, trunks
+let ghost = null; // another one through the same forest, and its label
 let t = 0; // the moment on show
 let reasons = null; // the answer to "why", of moment t
-let removed = null; // the entry of reasons.without that is looked at
+let removed = null; // the one of reasons.without that is looked at
 let playing = false;
 let busy = false; // a step is on its way
-let generation = 0; // of the flight on show: answers that come for an older one are dropped
-let loops = 0; // of the player: a pause ends its loop, even if a new one begins at once
-const landed = []; // flights that were flown by hand to their end, to save
+let generation = 0; // of the flight on show: what was asked about an older one is dropped
+let loops = 0; // of the player: a pause ends its loop, even if another one begins at once
+let later = 0; // the timer that writes the address
+const landed = []; // flights that were flown by hand to their end
 const stick = { held: {}, tapped: {}, side: 0, level: 0 };
+
+const world = () => options.worlds[chosen.world];
+const end = () => flight.moments.length - 1;
+const over = () => flight.ended !== "";
+const byHand = () => chosen.pilot === "you";
+const straight = () => (world().actions - 1) / 2;
+const number = (x) => x.toFixed(1).replace("-", "−");
+const signed = (x) => (x < 0 ? "" : "+") + number(x);
+const clock = (moment) => `${(moment * world().dt).toFixed(1)} s`;
+const say = (text) => ($("hint").textContent = text);
 
 // -------------------------------------------------- the server
 
@@ -33,59 +42,50 @@ function ask(path, more) {
   return post(path, { world, weights, seed, ...more });
 }
 
-function fly(actions, pilot, more, since, pictures = true) {
-  const counts = { more: String(more), since: String(since), pictures: pictures ? "1" : "0" };
-  return ask("/fly", { actions, pilot: pilot === "you" ? "network" : pilot, ...counts });
+// Fly these actions, then let the pilot fly `more` steps, and add what is not known yet.
+async function extend(to, actions, more = 0, pilot = "network", pictures = "0") {
+  const since = String(to.moments.length);
+  const answer = await ask("/fly", { actions, pilot, more: String(more), since, pictures });
+  to.moments.push(...answer.moments);
+  return Object.assign(to, {
+    record: answer.flight, actions: answer.flight.actions, ended: answer.ended, trunks: answer.trunks,
+  });
 }
 
-// A newer flight makes an older question pointless. Whatever else fails is told in one line.
+// Whether it went well. What fails is told in a line.
 async function attempt(action) {
-  const mine = generation;
   try {
-    return await action();
+    await action();
+    return true;
   } catch (error) {
     pause();
-    const lost = error instanceof TypeError ? "The server does not answer. Is it still running?" : error.message;
-    if (mine === generation) say(lost);
+    say(error instanceof TypeError ? `The server does not answer, or: ${error.message}` : error.message);
+    return false;
   }
 }
 
 // -------------------------------------------------- flights
 
-const world = () => options.worlds[chosen.world];
-const end = () => flight.moments.length - 1;
-const over = () => flight.ended !== "";
-const straight = () => (world().actions - 1) / 2;
-const mine = () => chosen.pilot === "you";
-
-function add(to, answer) {
-  to.moments.push(...answer.moments);
-  to.record = answer.flight;
-  to.actions = answer.flight.actions;
-  to.ended = answer.ended;
-}
-
-async function begin(actions = "", moment = 0) {
+async function begin(actions, moment) {
   const me = ++generation;
   pause();
-  const answer = await fly(actions, "you", 0, 0);
+  const found = await extend({ moments: [] }, actions, 0, "network", "1");
   if (me !== generation) return;
-  [flight, ghost] = [{ moments: [], trunks: answer.trunks }, null];
-  add(flight, answer);
+  [flight, ghost, reasons] = [found, null, null];
   drawForest();
   show(Math.min(moment, end()));
-  if (mine() && !actions) say("Press ← or → to take off. Hold to turn harder. The network flies along as a ghost.");
-  while (!mine() && !over()) {
-    const more = await fly(flight.actions, chosen.pilot, 25, flight.moments.length);
+  if (byHand() && !actions) say("Press ← or → to take off. Hold to turn harder. The network flies along as a ghost.");
+  if (!byHand()) say("Step through it, click a trunk, or click a bar. Then take over and do better.");
+  if (!byHand() && !actions) play();
+  while (!byHand() && !over()) {
+    await extend(found, found.actions, 25, chosen.pilot, "1");
     if (me !== generation) return;
-    add(flight, more);
     show(t);
   }
   if (chosen.pilot === "network") return;
-  const other = await fly("", "network", world().max_steps, 0, false);
-  if (me !== generation || ghost) return;
-  ghost = { label: "the network", moments: [] };
-  add(ghost, other);
+  const other = await extend({ label: "network", moments: [] }, "", world().max_steps);
+  if (me !== generation) return;
+  ghost = ghost || other;
   show(t);
 }
 
@@ -93,15 +93,14 @@ async function steer() {
   if (busy) return;
   busy = true;
   const [me, start] = [generation, performance.now()];
-  const answer = await fly(flight.actions + turn(), "you", 0, flight.moments.length).finally(() => (busy = false));
+  await extend(flight, flight.actions + turn(), 0, "network", "1").finally(() => (busy = false));
   if (me !== generation) return;
-  add(flight, answer);
   show(end());
   performance.measure("step to picture", { start });
   if (!over()) return;
   landed.push({ world: chosen.world, ...flight.record });
   pause();
-  say("R: fly this forest again. N: the next one. Or drag the time line back, and ask why the network would turn.");
+  say(`You: ${flight.ended}. R flies this forest again, N the next one. Or drag the time line, and ask why.`);
 }
 
 function turn() {
@@ -114,49 +113,41 @@ function turn() {
 
 function hold(side, down) {
   stick.held[side] = down ? 1 : 0;
-  if (!down) return;
-  if (!mine()) return say("Choose the pilot You, or Take over here, to steer.");
+  if (!down || over()) return;
+  if (!byHand() || t < end()) return say("To steer from this moment on, press Take over here.");
   stick.tapped[side] = 1;
-  if (t === end() && !over()) play();
+  play();
+}
+
+async function takeOver() {
+  chosen.pilot = "you";
+  drawChoices();
+  if (await attempt(() => begin(flight.actions.slice(0, t), t)) && t) say("You have the controls: ← or → fly on from here.");
 }
 
 async function whatIf(action) {
   pause();
   const [me, from] = [generation, t];
-  const turns = Number($("hold").value);
-  const way = flight.actions.slice(0, from);
-  // The turn may end the flight by itself, so it is flown step by step.
-  let answer = await fly(way, "network", 0, from, false);
-  const other = { label: `what if ${rate(action)} at ${clock(from)}`, moments: flight.moments.slice(0, from) };
-  add(other, answer);
-  for (let i = 0; i < turns && !other.ended; i++) {
-    add(other, await fly(other.actions + action, "network", 0, other.moments.length, false));
-  }
-  add(other, await fly(other.actions, "network", world().max_steps, other.moments.length, false));
+  const label = `what if ${rate(action)} at ${clock(from)}`;
+  const other = { label, moments: flight.moments.slice(0, from), actions: flight.actions.slice(0, from), whole: true };
+  // The turn may end the flight, and no action can follow that.
+  for (let i = 0; i < Number($("hold").value) && !other.ended; i++) await extend(other, other.actions + action);
+  await extend(other, other.actions, world().max_steps);
   if (me !== generation) return;
   ghost = other;
   show(from);
-  say(`With ${rate(action)} rad/s from here: ${other.ended}, total reward ${number(other.record.return)}. The flight on show: ${flight.ended || "still flies"}, ${number(flight.record.return)}.`);
-}
-
-function takeOver() {
-  chosen.pilot = "you";
-  const way = flight.actions.slice(0, t);
-  drawChoices();
-  attempt(() => begin(way, t)).then(() => say("You have the controls. Press ← or → to fly on, or space to go straight."));
+  say(`With ${rate(action)} rad/s from ${clock(from)} on it would have: ${other.ended}, total reward ${number(other.record.return)}.`);
 }
 
 // The greatest Q is what the network expects from here on. Where it falls most, it was surprised.
 function wentWrong() {
   pause();
-  const best = flight.moments.map((m) => Math.max(...m.q));
-  let worst = 0;
-  for (let i = 1; i < end() - 1; i++) {
-    if (best[i] - best[i + 1] > best[worst] - best[worst + 1]) worst = i;
-  }
-  if (end() < 2) return say("Nothing has been flown yet.");
+  const best = flight.moments.slice(0, -1).map(({ q }) => Math.max(...q));
+  const falls = best.slice(1).map((x, i) => best[i] - x);
+  if (!falls.length) return say("Fly first.");
+  const worst = falls.indexOf(Math.max(...falls));
   show(worst);
-  say(`At ${clock(worst)} the greatest Q falls most, from ${number(best[worst])} to ${number(best[worst + 1])}. Step on with . and see.`);
+  say(`After ${clock(worst)} the greatest Q falls most, from ${number(best[worst])} to ${number(best[worst + 1])}. Step on, and see.`);
 }
 
 // -------------------------------------------------- why
@@ -168,43 +159,39 @@ async function why(trunk = null) {
   if (me !== generation || at !== t) return;
   reasons = answer;
   removed = reasons.without.find((x) => x.trunk === trunk) || null;
-  if (trunk !== null && !removed) say("That trunk is in none of the four pictures. Without it nothing would change.");
   draw();
-  tellWhy();
+  drawReasons();
+  if (trunk !== null && !removed) say("That is in none of the four pictures: without it nothing would change.");
 }
 
-function tellWhy() {
-  const strongest = [...reasons.without].sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight));
+function drawReasons() {
   const text = document.createElement("p");
-  text.innerHTML = `It would turn <b>${rate(reasons.chosen)} rad/s</b>. How much of that turn's lead over the mean
-    Q hangs on each thing in view: <span class="for">for</span> it, <span class="against">against</span> it.`;
+  text.innerHTML = `It would turn <b>${rate(reasons.chosen)}</b> rad/s. How much this turn's lead over the mean Q owes
+    to each thing in view: <span class="for">a reason for it</span>, <span class="against">a reason against</span>.`;
   const row = document.createElement("div");
   row.className = "row";
+  const strongest = [...reasons.without].sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight));
   for (const x of strongest.slice(0, 8)) {
     const name = x.trunk < 0 ? "the goal's pole" : `trunk ${whereabouts(flight.trunks[x.trunk])}`;
-    const button = addButton(row, `${name} ${signed(x.weight)}`, () => why(x === removed ? null : x.trunk));
-    button.classList.add(x.weight > 0 ? "for" : "against");
+    const button = addButton(row, `${name} ${signed(x.weight)}`, () => attempt(() => why(x === removed ? null : x.trunk)));
+    button.className = x.weight > 0 ? "for" : "against";
     button.setAttribute("aria-pressed", x === removed);
-    button.title = "Take it out of this decision";
   }
-  if (!strongest.length) text.textContent = "Nothing is in view.";
   $("answer").replaceChildren(text, row);
 }
 
 function whereabouts([x, y]) {
   const [px, py, heading] = flight.moments[t].pose;
-  const [dx, dy] = [x - px, y - py];
-  const left = dy * Math.cos(heading) - dx * Math.sin(heading);
-  return `${Math.hypot(dx, dy).toFixed(0)} m off, ${Math.abs(left).toFixed(1)} m ${left > 0 ? "left" : "right"}`;
+  const left = (y - py) * Math.cos(heading) - (x - px) * Math.sin(heading);
+  return `${Math.hypot(x - px, y - py).toFixed(0)} m off, ${Math.abs(left).toFixed(1)} m ${left > 0 ? "left" : "right"}`;
 }
 
 function clickMap(event) {
   const place = new DOMPoint(event.clientX, event.clientY).matrixTransform($("map").getScreenCTM().inverse());
-  const far = ([x, y]) => Math.hypot(x - place.x, -y - place.y);
-  const nearest = flight.trunks.reduce((best, trunk, i) => (far(trunk) < far(flight.trunks[best]) ? i : best), 0);
-  const pole = far([world().length, 0]);
-  if (world().beacon && pole < Math.min(3, far(flight.trunks[nearest]))) return attempt(() => why(-1));
-  if (far(flight.trunks[nearest]) < 2.5) attempt(() => why(nearest));
+  const things = flight.trunks.map((trunk, i) => [i, trunk]);
+  if (world().beacon) things.push([-1, [world().length, 0]]);
+  const far = things.map(([i, [x, y]]) => [Math.hypot(x - place.x, y + place.y), i]).sort((a, b) => a[0] - b[0]);
+  if (far[0][0] < 2.5) attempt(() => why(far[0][1]));
 }
 
 // -------------------------------------------------- play
@@ -229,23 +216,22 @@ async function loop() {
   while (playing && me === loops) {
     if (t < end()) show(t + 1);
     else if (over()) pause();
-    else if (mine()) await steer();
+    else if (byHand()) await steer();
     due = Math.max(due + (1000 * world().dt) / Number($("speed").value), performance.now());
     await new Promise((wake) => setTimeout(wake, due - performance.now()));
   }
 }
 
-function stepOn() {
+function stepTo(moment) {
   pause();
-  if (t < end()) show(t + 1);
-  else if (mine() && !over()) attempt(steer);
+  if (moment <= end()) show(Math.max(moment, 0));
+  else if (byHand() && !over()) attempt(steer);
 }
 
 function show(moment) {
-  if (moment !== t || !reasons) {
-    [reasons, removed] = [null, null];
-    $("answer").replaceChildren();
-  }
+  if (moment !== t) reasons = null;
+  if (!reasons) $("answer").replaceChildren();
+  removed = reasons && removed;
   t = moment;
   draw();
   if (!playing) remember();
@@ -253,63 +239,39 @@ function show(moment) {
 
 // -------------------------------------------------- drawing
 
-const number = (x) => x.toFixed(1);
-const signed = (x) => (x < 0 ? "−" : "+") + Math.abs(x).toFixed(1);
-const clock = (moment) => `${(moment * world().dt).toFixed(1)} s`;
-
 function rate(action) {
   const x = world().yaw_rate * (action / straight() - 1);
-  return x === 0 ? "0" : (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).replace("0.", ".");
+  return x === 0 ? "0" : (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).slice(1);
 }
 
-function say(text) {
-  $("hint").textContent = text;
+function set(node, values) {
+  for (const [key, x] of Object.entries(values)) node.setAttribute(key, x);
+  return node;
 }
 
 function drawForest() {
-  const { length, width, back, trunk_radius, goal_radius, actions } = world();
-  const set = (id, values) => Object.entries(values).forEach(([key, x]) => $(id).setAttribute(key, x));
-  set("map", { viewBox: `-4 ${-width / 2 - 2} ${length + 8} ${width + 4}` });
-  set("ground", { x: -back, y: -width / 2, width: length + back, height: width });
-  set("goal", { cx: length, cy: 0, r: goal_radius });
-  $("trunks").replaceChildren(...flight.trunks.map(([x, y]) => {
-    const circle = document.createElementNS(SVG, "circle");
-    Object.entries({ cx: x, cy: -y, r: trunk_radius }).forEach(([key, value]) => circle.setAttribute(key, value));
-    return circle;
-  }));
-  if ($("bars").children.length === actions) return;
-  $("bars").replaceChildren();
-  for (let a = actions - 1; a >= 0; a--) {
+  const { length, width, back, goal_radius, actions } = world();
+  set($("map"), { viewBox: `-4 ${-width / 2 - 2} ${length + 8} ${width + 4}` });
+  set($("ground"), { x: -back, y: -width / 2, width: length + back, height: width });
+  set($("goal"), { cx: length, cy: 0, r: goal_radius });
+  const circle = ([cx, y]) => set(document.createElementNS("http://www.w3.org/2000/svg", "circle"), { cx, cy: -y });
+  $("trunks").replaceChildren(...flight.trunks.map(circle));
+  for (let a = actions - 1; a >= 0 && $("bars").children.length < actions; a--) {
     const bar = addButton($("bars"), "", () => attempt(() => whatIf(a)));
-    bar.innerHTML = `<span class="value"></span><span class="well"><i></i><i class="other"></i></span><span class="rate">${rate(a)}</span><span class="after"></span>`;
+    bar.innerHTML = `<span></span><span class="well"><i></i><i class="other"></i></span>
+      <span class="rate">${rate(a)}</span><span class="after"></span>`;
   }
 }
 
 function draw() {
-  drawPictures();
-  drawMap();
-  drawBars();
-  drawCurves();
-  drawTable();
+  [drawPictures, drawMap, drawTrunks, drawBars, drawCurves, drawTable].forEach((part) => part());
   $("time").max = end();
   $("time").value = t;
-  $("time").setAttribute("aria-valuetext", clock(t));
-  $("clock").textContent = `${clock(t)} / ${clock(end())}`;
-  $("banner").textContent = banner();
-}
-
-function banner() {
-  if (removed) return removed.trunk < 0 ? "without the goal's pole" : "without this trunk";
-  if (t === end() && over()) return `${flight.ended}, total reward ${number(flight.record.return)}`;
-  return mine() && end() === 0 ? "← or → to take off" : "";
-}
-
-function paint(canvas, frame) {
-  const grey = atob(frame);
-  const image = new ImageData(PIXELS, PIXELS);
-  for (let i = 0; i < grey.length; i++) image.data.fill(grey.charCodeAt(i), 4 * i, 4 * i + 3);
-  for (let i = 3; i < image.data.length; i += 4) image.data[i] = 255;
-  canvas.getContext("2d").putImageData(image, 0, 0);
+  set($("time"), { "aria-valuetext": clock(t) });
+  $("clock").textContent = `${clock(t)} of ${clock(end())}`;
+  const landing = t === end() && over() && `${flight.ended}, total reward ${number(flight.record.return)}`;
+  const hint = byHand() && !end() && "← or → to take off";
+  $("banner").textContent = removed ? `without ${removed.trunk < 0 ? "the goal's pole" : "this trunk"}` : landing || hint || "";
 }
 
 function drawPictures() {
@@ -317,91 +279,87 @@ function drawPictures() {
   [...$("stack").children].forEach((canvas, i) => paint(canvas, flight.moments[Math.max(t - 3 + i, 0)].frame));
 }
 
-function way(moments) {
-  return moments.map(({ pose: [x, y] }) => `${x.toFixed(2)},${(-y).toFixed(2)}`).join(" ");
+function paint(canvas, frame) {
+  const [grey, image] = [atob(frame), new ImageData(PIXELS, PIXELS)];
+  for (let i = 0; i < grey.length; i++) {
+    image.data.fill(grey.charCodeAt(i), 4 * i, 4 * i + 3);
+    image.data[4 * i + 3] = 255;
+  }
+  canvas.getContext("2d").putImageData(image, 0, 0);
 }
 
 function drawMap() {
-  const [x, y, heading] = flight.moments[t].pose;
-  const place = `translate(${x} ${-y}) rotate(${(-heading * 180) / Math.PI})`;
-  const { view } = world();
-  const edge = view * Math.tan(options.half_view);
-  $("drone").setAttribute("transform", place);
-  $("view").setAttribute("transform", place);
-  $("view").setAttribute("d", `M0 0L${view} ${edge}V${-edge}Z`);
-  $("whole-way").setAttribute("points", way(flight.moments));
-  $("way").setAttribute("points", way(flight.moments.slice(0, t + 1)));
+  const way = (moments) => moments.map(({ pose: [x, y] }) => `${x.toFixed(2)},${(-y).toFixed(2)}`).join(" ");
+  const place = ([x, y, heading]) => `translate(${x} ${-y}) rotate(${(-heading * 180) / Math.PI})`;
+  const edge = world().view * Math.tan(options.half_view);
+  for (const id of ["drone", "view"]) set($(id), { transform: place(flight.moments[t].pose) });
+  set($("view"), { d: `M0 0L${world().view} ${edge}V${-edge}Z` });
+  set($("whole-way"), { points: way(flight.moments) });
+  set($("way"), { points: way(flight.moments.slice(0, t + 1)) });
   // Who flies by hand should not see where the ghost is going to turn.
-  const shown = !ghost ? [] : mine() && !over() && !ghost.label.startsWith("what") ? ghost.moments.slice(0, t + 1) : ghost.moments;
-  $("ghost-way").setAttribute("points", way(shown));
-  $("ghost").style.display = ghost ? "" : "none";
-  const at = ghost ? ghost.moments[Math.min(t, ghost.moments.length - 1)].pose : [0, 0];
-  $("ghost").setAttribute("cx", at[0]);
-  $("ghost").setAttribute("cy", -at[1]);
-  $("main-name").textContent = mine() ? "you" : chosen.pilot;
-  $("ghost-name").textContent = ghost ? ghost.label : "(no second flight)";
-  paintTrunks();
+  const known = ghost ? ghost.moments.slice(0, byHand() && !over() && !ghost.whole ? t + 1 : undefined) : [];
+  set($("ghost-way"), { points: way(known) });
+  const at = ghost && ghost.moments[Math.min(t, ghost.moments.length - 1)].pose;
+  set($("ghost"), { transform: at ? place(at) : "translate(-99 0)" });
+  $("main-name").textContent = chosen.pilot;
+  $("ghost-name").textContent = ghost ? ghost.label : "–";
 }
 
-function paintTrunks() {
-  const most = Math.max(...(reasons ? reasons.without : []).map((x) => Math.abs(x.weight)), 1e-9);
-  const known = new Map((reasons ? reasons.without : []).map((x) => [x.trunk, x]));
+function drawTrunks() {
+  const found = new Map((reasons ? reasons.without : []).map((x) => [x.trunk, x]));
+  const most = Math.max(...[...found.values()].map((x) => Math.abs(x.weight)), 1e-9);
+  const kind = (x) => (!x ? "" : x === removed ? "removed" : x.weight > 0 ? "for" : "against");
   [...$("trunks").children].forEach((circle, i) => {
-    const x = known.get(i);
+    const x = found.get(i);
     const share = x ? Math.abs(x.weight) / most : 0;
-    circle.setAttribute("class", !x ? "" : x === removed ? "removed" : x.weight > 0 ? "for" : "against");
-    circle.style.fillOpacity = x ? 0.35 + 0.65 * share : "";
-    circle.setAttribute("r", world().trunk_radius * (x ? 1.2 + share : 1));
+    set(circle, { class: kind(x), r: world().trunk_radius * (1 + 1.5 * share), "fill-opacity": x ? 0.3 + 0.7 * share : 1 });
   });
 }
 
 function drawBars() {
-  const q = flight.moments[t].q;
-  const other = removed ? removed.q : null;
-  const all = [...q, ...(other || [])];
-  const [low, high] = [Math.min(...all), Math.max(...all)];
+  const [q, other] = [flight.moments[t].q, removed && removed.q];
+  const [low, high] = [Math.min(...q, ...(other || q)), Math.max(...q, ...(other || q))];
   const height = (x) => `${(100 * (x - low)) / Math.max(high - low, 1e-9)}%`;
   [...$("bars").children].forEach((bar, i) => {
-    const a = q.length - 1 - i;
+    const a = q.length - 1 - i; // the sharpest left turn stands leftmost
     const [value, well, , after] = bar.children;
-    value.textContent = number(q[a]);
-    after.textContent = other ? number(other[a]) : "";
-    well.children[0].style.height = height(q[a]);
-    well.children[1].style.height = other ? height(other[a]) : "";
-    well.children[1].hidden = !other;
-    bar.className = (q[a] === Math.max(...q) ? "best " : "") + (Number(flight.actions[t]) === a ? "flown" : "");
-    bar.setAttribute("aria-label", `what if ${rate(a)} radians a second? Q ${number(q[a])}${other ? `, without it ${number(other[a])}` : ""}`);
+    const [before, without] = well.children;
+    [value.textContent, after.textContent] = [number(q[a]), other ? number(other[a]) : ""];
+    [before.style.height, without.style.height, without.hidden] = [height(q[a]), height(other ? other[a] : low), !other];
+    bar.classList.toggle("best", q[a] === Math.max(...q));
+    bar.classList.toggle("flown", flight.actions[t] === String(a));
+    const changed = other ? `, without it ${number(other[a])}` : "";
+    set(bar, { "aria-label": `${rate(a)} radians a second: Q ${number(q[a])}${changed}. What if it turned so?` });
   });
 }
 
-const CURVES = { reward: "reward", return: "total reward", d_obs: "nearest bark, m" };
-
 function drawCurves() {
-  Object.keys(CURVES).forEach((key, i) => {
-    const [label, svg] = $("curves").children[i].children;
-    const values = flight.moments.map((m) => m[key]);
+  for (const row of $("curves").children) {
+    const [label, svg] = row.children;
+    const values = flight.moments.map((moment) => moment[row.dataset.key]);
     const [low, high] = [Math.min(0, ...values), Math.max(1, ...values)];
-    const [across, up] = [(k) => (100 * k) / Math.max(end(), 1), (x) => 30 - (30 * (x - low)) / (high - low)];
-    svg.children[0].setAttribute("d", "M" + values.map((x, k) => `${across(k).toFixed(2)} ${up(x).toFixed(2)}`).join("L"));
-    svg.children[1].setAttribute("d", `M${across(t)} 0V30`);
+    const x = (moment) => ((100 * moment) / Math.max(end(), 1)).toFixed(2);
+    const y = (value) => (30 - (30 * (value - low)) / (high - low)).toFixed(2);
+    set(svg.children[0], { d: `M${values.map((value, moment) => `${x(moment)} ${y(value)}`).join("L")}` });
+    set(svg.children[1], { d: `M${x(t)} 0V30` });
     label.lastChild.textContent = number(values[t]);
-  });
+  }
 }
 
 function drawTable() {
-  const flights = [[mine() ? "you" : chosen.pilot, flight], ...(ghost ? [[ghost.label, ghost]] : [])];
-  const hidden = mine() && !over();
-  const yes = (x) => (x ? "yes" : "no");
   const rows = {
     steps: (x) => x.steps,
-    crossed: (x) => yes(x.outcome === "goal" || x.edge === "far"),
-    crashed: (x) => yes(x.outcome === "crash"),
-    arrived: (x) => yes(x.outcome === "goal"),
+    crossed: (x) => x.outcome === "goal" || x.edge === "far",
+    crashed: (x) => x.outcome === "crash",
+    arrived: (x) => x.outcome === "goal",
     "total reward": (x) => number(x.return),
   };
-  const cells = (row) => flights.map(([, f]) => `<td>${f.ended && !(hidden && f === ghost) ? row(f.record) : "…"}</td>`).join("");
-  $("table").innerHTML = `<tr><th></th>${flights.map(([name]) => `<th scope="col">${name}</th>`).join("")}</tr>` +
-    Object.entries(rows).map(([name, row]) => `<tr><th scope="row">${name}</th>${cells(row)}</tr>`).join("");
+  const text = (x) => ({ true: "yes", false: "no" })[x] || x;
+  const flights = [{ ...flight, label: chosen.pilot }, ghost].filter(Boolean);
+  const cell = (f, row) => (f.ended && (over() || f.whole) ? text(row(f.record)) : "…");
+  const line = (name, cells, kind) => `<tr><th scope="row">${name}</th>${cells.map((x) => `<${kind}>${x}</${kind}>`).join("")}</tr>`;
+  const body = Object.entries(rows).map(([name, row]) => line(name, flights.map((f) => cell(f, row)), "td"));
+  $("table").innerHTML = line("", flights.map((f) => f.label), "th") + body.join("");
 }
 
 // -------------------------------------------------- choices, address, file
@@ -413,11 +371,15 @@ function addButton(parent, text, action) {
   return button;
 }
 
-function choose(change, actions = "", moment = 0) {
+async function choose(change, actions = "", moment = 0) {
+  const before = chosen;
   chosen = { ...chosen, ...change };
   if (!world().weights.includes(chosen.weights)) chosen.weights = world().weights[0];
   drawChoices();
-  return attempt(() => begin(actions, moment));
+  const well = await attempt(() => begin(actions, moment));
+  if (well || !flight) return well;
+  chosen = before;
+  drawChoices();
 }
 
 function drawChoices() {
@@ -425,118 +387,100 @@ function drawChoices() {
   for (const [key, all] of Object.entries(names)) {
     const row = $(`${key}s`);
     if (!row.children.length) all.forEach((name) => addButton(row, name, () => choose({ [key]: name })));
-    [...row.children].forEach((button) => button.setAttribute("aria-pressed", button.textContent === chosen[key]));
+    for (const button of row.children) set(button, { "aria-pressed": button.textContent === chosen[key] });
   }
   $("weights").replaceChildren(...world().weights.map((name) => new Option(name, name, false, name === chosen.weights)));
   $("seed").value = chosen.seed;
 }
 
-function address() {
-  const { world, weights, pilot, seed } = chosen;
-  return "#" + new URLSearchParams({ world, weights, pilot, seed, t, actions: flight.actions });
+function writeAddress() {
+  const { actions } = flight;
+  history.replaceState(null, "", `#${new URLSearchParams({ ...chosen, t, actions })}`);
 }
 
-// Browsers complain if the address changes more than some times a second.
-let later = 0;
+// Browsers complain if the address changes many times a second.
 function remember() {
   clearTimeout(later);
-  later = setTimeout(() => flight && history.replaceState(null, "", address()), 150);
+  later = setTimeout(() => flight && writeAddress(), 150);
 }
 
-function restore() {
+async function restore() {
   const told = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
-  const first = Object.keys(options.worlds)[0];
-  chosen = { pilot: "you", world: first, seed: "1", weights: "" };
-  const change = {};
-  if (options.pilots.includes(told.pilot)) change.pilot = told.pilot;
-  if (told.world in options.worlds) change.world = told.world;
-  if (told.seed) change.seed = told.seed;
-  const known = options.worlds[change.world || first].weights;
-  if (told.weights && !known.includes(told.weights)) say(`There are no weights ${told.weights} here.`);
-  choose({ ...change, weights: told.weights }, told.actions || "", Number(told.t) || 0);
+  const first = { pilot: "you", world: Object.keys(options.worlds)[0], seed: "1" };
+  const known = { pilot: options.pilots.includes(told.pilot), world: told.world in options.worlds, seed: told.seed };
+  const change = Object.fromEntries(Object.keys(first).map((key) => [key, known[key] ? told[key] : first[key]]));
+  const moment = Math.trunc(Math.abs(Number(told.t))) || 0;
+  if (await choose({ ...change, weights: told.weights }, told.actions, moment) || flight) return;
+  const wrong = $("hint").textContent;
+  if (await choose(first)) say(wrong);
 }
 
 async function share() {
-  history.replaceState(null, "", address());
+  writeAddress();
   await navigator.clipboard.writeText(location.href).catch(() => null);
   say("The address of this page holds this flight at this moment. It is copied: paste it anywhere.");
 }
 
 function save() {
   const flights = landed.filter((f) => f.world === chosen.world && f.seed < options.train_end);
-  if (!flights.length) return say("Fly to an end first, in a forest below 1,000,000,000: others are for tests.");
+  if (!flights.length) return say("Fly to an end first, in a forest below 1,000,000,000: the others are for tests.");
   const { beacon, camera } = world();
-  const report = { program: "Deep Flight", weights: chosen.weights, beacon, camera, first_seed: flights[0].seed };
-  report.pilots = { you: { flights: flights.map(({ world, ...f }) => f) } };
-  report.forests = flights.length;
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(new Blob([JSON.stringify(report)], { type: "application/json" }));
-  link.download = "flights.json";
-  link.click();
+  const head = { program: "Deep Flight", weights: chosen.weights, beacon, camera, first_seed: flights[0].seed };
+  const pilots = { you: { flights: flights.map(({ world, ...record }) => record) } };
+  const file = new Blob([JSON.stringify({ ...head, forests: flights.length, pilots })], { type: "application/json" });
+  Object.assign(document.createElement("a"), { href: URL.createObjectURL(file), download: "flights.json" }).click();
   const flags = (beacon ? " --beacon" : "") + (camera === "grey" ? "" : ` --camera ${camera}`);
-  say(`${flights.length} of your flights saved. To teach with them: deepflight.py train --demos flights.json${flags}`);
+  say(`Flights by hand: ${flights.length}. Teach with them: python deepflight.py train --demos flights.json${flags}`);
 }
 
 // -------------------------------------------------- keys and buttons
 
-const next = () => choose({ seed: String(BigInt(chosen.seed) + 1n) });
-const again = () => choose({});
-const KEYS = {
-  " ": () => (playing ? pause() : play()),
-  ",": () => (pause(), show(Math.max(t - 1, 0))),
-  ".": stepOn, n: next, r: again,
+const actions = {
+  play: () => (playing ? pause() : play()),
+  back: () => stepTo(t - 1),
+  step: () => stepTo(t + 1),
+  next: () => choose({ seed: String(BigInt(chosen.seed) + 1n) }),
+  again: () => choose({}),
+  random: () => choose({ seed: String(Math.floor(Math.random() * options.train_end)) }),
+  why: () => attempt(() => why()),
+  wrong: wentWrong, take: takeOver, share, save,
 };
+const KEYS = { " ": "play", ",": "back", ".": "step", n: "next", r: "again", w: "why" };
 const SIDES = { ArrowLeft: "left", a: "left", ArrowRight: "right", d: "right" };
 
 function key(event) {
   const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-  const typing = event.target.matches("input, select") || (name === " " && event.target.matches("button"));
-  if (typing || event.ctrlKey || event.metaKey || event.altKey || !flight) return;
-  const side = SIDES[name];
-  if (!side && !KEYS[name]) return;
+  const own = event.target.matches("input, select") || (name === " " && event.target.matches("button"));
+  const [side, action] = [SIDES[name], actions[KEYS[name]]];
+  if (own || event.ctrlKey || event.metaKey || event.altKey || !flight || !(side || action)) return;
   event.preventDefault();
-  if (side && !event.repeat) hold(side, true);
-  if (!side) KEYS[name]();
+  if (side && !event.repeat) hold(side, event.type === "keydown");
+  if (action && event.type === "keydown") action();
 }
 
 function listen() {
   const on = (id, event, action) => $(id).addEventListener(event, action);
-  document.addEventListener("keydown", key);
-  document.addEventListener("keyup", (event) => hold(SIDES[event.key.length === 1 ? event.key.toLowerCase() : event.key], false));
+  for (const type of ["keydown", "keyup"]) document.addEventListener(type, key);
   window.addEventListener("blur", () => (stick.held = {}));
   window.addEventListener("hashchange", restore);
-  document.addEventListener("visibilitychange", () => document.hidden && flight && pause());
-  // A button that was clicked by a mouse would keep the focus, and take the space key.
-  document.addEventListener("click", (event) => event.detail && document.activeElement.matches("button") && document.activeElement.blur());
+  document.addEventListener("visibilitychange", () => document.hidden && pause());
+  // What was clicked by a mouse would keep the focus, and take the keys that steer.
+  document.addEventListener("click", (event) => event.detail && event.target.matches("button, #time") && event.target.blur());
   for (const side of ["left", "right"]) {
     on(side, "pointerdown", () => hold(side, true));
-    ["pointerup", "pointerleave", "pointercancel"].forEach((name) => on(side, name, () => hold(side, false)));
+    for (const name of ["pointerup", "pointerleave", "pointercancel"]) on(side, name, () => hold(side, false));
   }
-  const clicks = { next, share, save, wrong: wentWrong, take: takeOver, play: KEYS[" "], back: KEYS[","], step: stepOn };
-  for (const [id, action] of Object.entries(clicks)) on(id, "click", () => flight && action());
-  on("why", "click", () => attempt(() => why()));
-  on("random", "click", () => choose({ seed: String(Math.floor(Math.random() * options.train_end)) }));
+  for (const [name, action] of Object.entries(actions)) if ($(name)) on(name, "click", () => flight && action());
   on("map", "click", clickMap);
-  on("time", "input", () => (pause(), show(Number($("time").value))));
-  on("time", "pointerup", () => $("time").blur());
-  on("seed", "change", () => ($("seed").blur(), choose({ seed: $("seed").value.trim() })));
-  on("weights", "change", () => ($("weights").blur(), choose({ weights: $("weights").value })));
-  for (const id of ["hold", "speed"]) on(id, "change", () => $(id).blur());
+  on("time", "input", () => stepTo(Number($("time").value)));
+  on("seed", "change", () => choose({ seed: $("seed").value.trim() }));
+  on("weights", "change", () => choose({ weights: $("weights").value }));
+  for (const id of ["seed", "weights", "hold", "speed"]) on(id, "change", () => $(id).blur());
 }
 
-async function start() {
-  for (let i = 0; i < 4; i++) {
-    const canvas = $("stack").appendChild(document.createElement("canvas"));
-    canvas.width = canvas.height = PIXELS;
-  }
-  for (const label of Object.values(CURVES)) {
-    const row = $("curves").appendChild(document.createElement("div"));
-    row.className = "curve";
-    row.innerHTML = `<span>${label} <b></b></span><svg viewBox="0 0 100 30" preserveAspectRatio="none" aria-hidden="true"><path/><path class="cursor"/></svg>`;
-  }
+attempt(async () => {
+  for (const canvas of $("stack").children) canvas.width = canvas.height = PIXELS;
   options = await post("/options", {});
   listen();
-  restore();
-}
-
-attempt(start);
+  await restore();
+});
