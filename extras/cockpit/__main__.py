@@ -64,6 +64,7 @@ class Handler(BaseHTTPRequestHandler):
 
     server: Server
     protocol_version, timeout = "HTTP/1.1", 60  # s without a word, then the connection closes
+    default_request_version = "HTTP/1.0"  # even a request that names none gets a status line
     disable_nagle_algorithm = True  # or the second half of an answer waits 40 ms for the first
 
     def do_GET(self) -> None:
@@ -126,6 +127,15 @@ class Handler(BaseHTTPRequestHandler):
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """What http.server itself cannot read is a malformed request too."""
         self.answer(400, message or "malformed request")
+
+    def finish(self) -> None:
+        """Hang up, but hear out what is still being sent, or the answer may not arrive."""
+        super().finish()
+        with suppress(OSError):
+            self.connection.shutdown(socket.SHUT_WR)
+            self.connection.settimeout(1)  # s
+            while self.connection.recv(2**16):
+                pass
 
     def log_message(self, *args: Any) -> None:
         """Be silent: ten lines a second help nobody."""
