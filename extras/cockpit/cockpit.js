@@ -48,7 +48,7 @@ async function extend(to, actions, more = 0, pilot = "network", pictures = "0") 
   const answer = await ask("/fly", { actions, pilot, more: String(more), since, pictures });
   to.moments.push(...answer.moments);
   return Object.assign(to, {
-    record: answer.flight, actions: answer.flight.actions, ended: answer.ended, trunks: answer.trunks,
+    record: answer.flight, actions: answer.flight.actions, ended: answer.ended, trunks: answer.trunks || to.trunks,
   });
 }
 
@@ -71,16 +71,18 @@ async function begin(actions, moment) {
   pause();
   const found = await extend({ moments: [] }, actions, 0, "network", "1");
   if (me !== generation) return;
-  [flight, ghost, reasons] = [found, null, null];
+  [flight, ghost] = [found, null];
   drawForest();
-  show(Math.min(moment, end()));
-  if (byHand() && !actions) say("Press ← or → to take off. Hold to turn harder. The network flies along as a ghost.");
-  if (!byHand()) say("Step through it, click a trunk, or click a bar. Then take over and do better.");
-  if (!byHand() && !actions) play();
+  forget();
+  show(Math.min(moment || 0, end()));
+  if (!byHand() || over()) say("Drag the time line. Click a trunk or a bar to ask the network. Or take over, and do better.");
+  else if (actions) say("You have the controls: ← or → fly on from here, space flies straight on.");
+  else say("Press ← or → to take off. Hold to turn harder. The network flies along as a ghost.");
+  if (!byHand() && moment === null) play();
   while (!byHand() && !over()) {
     await extend(found, found.actions, 25, chosen.pilot, "1");
     if (me !== generation) return;
-    show(t);
+    show(playing || t >= moment ? t : Math.min(moment, end()));
   }
   if (chosen.pilot === "network") return;
   const other = await extend({ label: "network", moments: [] }, "", world().max_steps);
@@ -96,7 +98,7 @@ async function steer() {
   await extend(flight, flight.actions + turn(), 0, "network", "1").finally(() => (busy = false));
   if (me !== generation) return;
   show(end());
-  performance.measure("step to picture", { start });
+  requestAnimationFrame(() => performance.measure("step to picture", { start }));
   if (!over()) return;
   landed.push({ world: chosen.world, ...flight.record });
   pause();
@@ -117,12 +119,6 @@ function hold(side, down) {
   if (!byHand() || t < end()) return say("To steer from this moment on, press Take over here.");
   stick.tapped[side] = 1;
   play();
-}
-
-async function takeOver() {
-  chosen.pilot = "you";
-  drawChoices();
-  if (await attempt(() => begin(flight.actions.slice(0, t), t)) && t) say("You have the controls: ← or → fly on from here.");
 }
 
 async function whatIf(action) {
@@ -160,8 +156,15 @@ async function why(trunk = null) {
   reasons = answer;
   removed = reasons.without.find((x) => x.trunk === trunk) || null;
   draw();
+  drawTrunks();
   drawReasons();
   if (trunk !== null && !removed) say("That is in none of the four pictures: without it nothing would change.");
+}
+
+function forget() {
+  reasons = removed = null;
+  $("answer").replaceChildren();
+  drawTrunks();
 }
 
 function drawReasons() {
@@ -229,9 +232,7 @@ function stepTo(moment) {
 }
 
 function show(moment) {
-  if (moment !== t) reasons = null;
-  if (!reasons) $("answer").replaceChildren();
-  removed = reasons && removed;
+  if (moment !== t && reasons) forget();
   t = moment;
   draw();
   if (!playing) remember();
@@ -264,7 +265,7 @@ function drawForest() {
 }
 
 function draw() {
-  [drawPictures, drawMap, drawTrunks, drawBars, drawCurves, drawTable].forEach((part) => part());
+  [drawPictures, drawMap, drawBars, drawCurves, drawTable].forEach((part) => part());
   $("time").max = end();
   $("time").value = t;
   set($("time"), { "aria-valuetext": clock(t) });
@@ -281,10 +282,8 @@ function drawPictures() {
 
 function paint(canvas, frame) {
   const [grey, image] = [atob(frame), new ImageData(PIXELS, PIXELS)];
-  for (let i = 0; i < grey.length; i++) {
-    image.data.fill(grey.charCodeAt(i), 4 * i, 4 * i + 3);
-    image.data[4 * i + 3] = 255;
-  }
+  const colours = new Uint32Array(image.data.buffer);
+  for (let i = 0; i < grey.length; i++) colours[i] = 0xff000000 + 0x10101 * grey.charCodeAt(i);
   canvas.getContext("2d").putImageData(image, 0, 0);
 }
 
@@ -302,13 +301,15 @@ function drawMap() {
   const at = ghost && ghost.moments[Math.min(t, ghost.moments.length - 1)].pose;
   set($("ghost"), { transform: at ? place(at) : "translate(-99 0)" });
   $("main-name").textContent = chosen.pilot;
-  $("ghost-name").textContent = ghost ? ghost.label : "–";
+  $("ghost-name").textContent = ghost ? ghost.label : "";
+  $("ghost-mark").hidden = !ghost;
 }
 
 function drawTrunks() {
   const found = new Map((reasons ? reasons.without : []).map((x) => [x.trunk, x]));
   const most = Math.max(...[...found.values()].map((x) => Math.abs(x.weight)), 1e-9);
   const kind = (x) => (!x ? "" : x === removed ? "removed" : x.weight > 0 ? "for" : "against");
+  set($("goal"), { class: kind(found.get(-1)) });
   [...$("trunks").children].forEach((circle, i) => {
     const x = found.get(i);
     const share = x ? Math.abs(x.weight) / most : 0;
@@ -371,7 +372,7 @@ function addButton(parent, text, action) {
   return button;
 }
 
-async function choose(change, actions = "", moment = 0) {
+async function choose(change, actions = "", moment = null) {
   const before = chosen;
   chosen = { ...chosen, ...change };
   if (!world().weights.includes(chosen.weights)) chosen.weights = world().weights[0];
@@ -443,7 +444,8 @@ const actions = {
   again: () => choose({}),
   random: () => choose({ seed: String(Math.floor(Math.random() * options.train_end)) }),
   why: () => attempt(() => why()),
-  wrong: wentWrong, take: takeOver, share, save,
+  take: () => choose({ pilot: "you" }, flight.actions.slice(0, t), t),
+  wrong: wentWrong, share, save,
 };
 const KEYS = { " ": "play", ",": "back", ".": "step", n: "next", r: "again", w: "why" };
 const SIDES = { ArrowLeft: "left", a: "left", ArrowRight: "right", d: "right" };

@@ -189,21 +189,15 @@ class Hangar:
     def options(self, ask: Any) -> dict[str, Any]:
         """What one may choose from, and the numbers of each world that the page draws with."""
         check(ask)
-        worlds = {
-            name: asdict(WORLDS[name]) | {"weights": [*networks]}
-            for name, networks in self.networks().items()
-        }
-        half_view = float(BEARINGS[0])  # rad, from ahead to the left edge of a picture
+        worlds = self.networks()
+        worlds = {w: asdict(WORLDS[w]) | {"weights": [*names]} for w, names in worlds.items()}
+        view = float(BEARINGS[0])  # rad, from ahead to the left edge of a picture
         pilots = ["you", *PILOTS]
-        return {
-            "worlds": worlds,
-            "pilots": pilots,
-            "half_view": half_view,
-            "train_end": TRAIN_END,
-        }
+        return {"worlds": worlds, "pilots": pilots, "half_view": view, "train_end": TRAIN_END}
 
     def fly(self, ask: Any) -> dict[str, Any]:
-        """Fly the actions, then let the pilot fly `more` steps. Tells the moments from `since`."""
+        """Fly the actions, then let the pilot fly `more` steps. Tells the moments from `since`, and
+        the trunks if that is 0."""
         check(ask, *FLIGHT, "pilot", "more", "since", "pictures")
         flight = self.find(ask)
         for _ in range(int(ask["more"])):
@@ -211,14 +205,11 @@ class Hangar:
                 break
             flight.step(PILOTS[ask["pilot"]](flight))
         self.keep(flight)
-        told = range(int(ask["since"]), len(flight.moments))
-        record = flight.drone.flight()
-        return {
-            "flight": record,
-            "ended": ENDS[record["edge"] or record["outcome"]],
-            "trunks": flight.drone.trunks.tolist(),
-            "moments": [flight.show(t, ask["pictures"] == "1") for t in told],
-        }
+        first, record = int(ask["since"]), flight.drone.flight()
+        told = range(first, len(flight.moments))
+        answer = {"flight": record, "ended": ENDS[record["edge"] or record["outcome"]]}
+        answer |= {"trunks": flight.drone.trunks.tolist()} if first == 0 else {}
+        return answer | {"moments": [flight.show(t, ask["pictures"] == "1") for t in told]}
 
     def why(self, ask: Any) -> dict[str, Any]:
         """What each thing in view does to the decision at moment `time`: Q with and without it.

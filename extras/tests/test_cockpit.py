@@ -186,14 +186,23 @@ def test_only_this_machine_can_connect(server: Server) -> None:
 BAD = {
     "world": ["", "moon", "plain\n", 1, None, [], True, "\ud800"],
     "weights": ["", "../weights/paper", "/etc/passwd", "paper.pt", "runs/..", "a" * 400, 7],
-    "seed": ["-1", "1.0", "", "1" * 19, "٣", 1, None, " 1", "1e3", "NaN"],
-    "actions": ["9", "4" * 1001, "4 4", "４", ["4"], 44, None, "4" * 400],
+    "seed": ["-1", "1.0", "", "1" * 19, "\u0663", 1, None, " 1", "1e3", "NaN"],
+    "actions": ["9", "4" * 1001, "4 4", "\uff14", ["4"], 44, None, "4" * 400],
     "pilot": ["you", "", "dqn", None, {}],
     "more": ["-1", "10000", 5, "x"],
     "since": ["-0", "1e9", None],
     "pictures": ["yes", True, ""],
 }
-PATHS = ("/fly", "/why", "/options", "/etc/passwd", "/../env.py", "/x//", "/cockpit.js?x", "/%2e%2e")
+PATHS = (
+    "/fly",
+    "/why",
+    "/options",
+    "/etc/passwd",
+    "/../env.py",
+    "/x//",
+    "/cockpit.js?x",
+    "/%2e%2e",
+)
 
 
 def garbage(rng: Generator) -> bytes:
