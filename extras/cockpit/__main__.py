@@ -13,116 +13,85 @@ path: weights are looked up by name in a list. Whatever is malformed gets 400 an
 Not here: encryption, users, other machines. Do not put this server on a network.
 """
 
-import signal
-
-if __name__ == "__main__" and signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback while torch loads, for seconds
-
-import errno
 import json
 import os
 import socket
 import sys
 import threading
-from collections.abc import Sequence
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from deepflight import Parser
-from env import say, whole_number
-from extras.cockpit.flights import Hangar
-
-HOST, PORT = "127.0.0.1", 8642
-FOLDER, LARGEST = Path(__file__).parent, 2**14  # bytes of a request's body
-PAGE = {
-    "/": ("index.html", "text/html"),
-    "/cockpit.js": ("cockpit.js", "text/javascript"),
-    "/cockpit.css": ("cockpit.css", "text/css"),
-}
-POLICY = "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; form-action 'none'"
+HOST, PORT, LARGEST = "127.0.0.1", 8642, 2**14  # LARGEST: bytes of a request's body
+FOLDER, PAGE = Path(__file__).parent, {"index.html": "html", "cockpit.js": "javascript"}
+FILES = {f"/{name}": (FOLDER / name, f"text/{kind}") for name, kind in PAGE.items()}
+FILES |= {"/": FILES["/index.html"], "/cockpit.css": (FOLDER / "cockpit.css", "text/css")}
+HEADERS = {"X-Content-Type-Options": "nosniff", "Cache-Control": "no-store"}
+HEADERS["Content-Security-Policy"] = "default-src 'self'; img-src data:; frame-ancestors 'none'"
 
 
 class Server(ThreadingHTTPServer):
     """Each connection has a thread, because browsers hold several open. Answers wait in line."""
 
-    def __init__(self, port: int, hangar: Hangar) -> None:
+    def __init__(self, port: int, hangar: Any) -> None:
         super().__init__((HOST, port), Handler)
         self.lock = threading.Lock()
         self.answers = {"/options": hangar.options, "/fly": hangar.fly, "/why": hangar.why}
-        self.hosts = [f"{name}:{self.server_port}" for name in (HOST, "localhost")]
+        self.ours = [f"http://{name}:{self.server_port}" for name in (HOST, "localhost")]
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
+    def handle_error(self, *args: Any) -> None:
         """A connection that breaks concerns nobody else."""
 
 
 class Handler(BaseHTTPRequestHandler):
     """One connection."""
 
-    server: Server
-    protocol_version, timeout = "HTTP/1.1", 60  # s without a word, then the connection closes
-    default_request_version = "HTTP/1.0"  # even a request that names none gets a status line
-    disable_nagle_algorithm = True  # or the second half of an answer waits 40 ms for the first
+    # Even a request that names no version gets a status line. Nagle's algorithm would keep the
+    # second half of an answer back for 40 ms. After 60 s without a word the connection closes.
+    protocol_version, default_request_version = "HTTP/1.1", "HTTP/1.0"
+    disable_nagle_algorithm, timeout = True, 60
+
+    def parse_request(self) -> bool:
+        """Read a request's head, and refuse what another site's page may have asked."""
+        if not super().parse_request():
+            return False
+        asked = [f"http://{host}" for host in self.headers.get_all("Host", [""])]
+        if {*asked, *self.headers.get_all("Origin", [])}.issubset(self.server.ours):
+            return True
+        self.answer(403, f"this server talks to its own page alone, at {self.server.ours[0]}")
+        return False
 
     def do_GET(self) -> None:
         """Send a file of the page."""
-        if self.foreign():
-            return
-        if self.path not in PAGE:
-            return self.answer(404, "no such page")
-        name, kind = PAGE[self.path]
-        self.answer(200, (FOLDER / name).read_bytes(), f"{kind}; charset=utf-8")
+        file, kind = FILES.get(self.path, (None, ""))
+        self.answer(200, file.read_bytes(), kind) if file else self.answer(404, "no such page")
 
     def do_POST(self) -> None:
         """Answer a question."""
-        if self.foreign():
-            return
-        if self.path not in self.server.answers:
+        if not (answer := self.server.answers.get(self.path)):
             return self.answer(404, "no such question")
         try:
-            ask = json.loads(self.body())
+            if not 0 <= (length := int(self.headers["Content-Length"] or -1)) <= LARGEST:
+                raise ValueError(f"a request says its length, {LARGEST} bytes at most")
+            ask = json.loads(self.rfile.read(length))
             with self.server.lock:
-                answer = self.server.answers[self.path](ask)
-        except (ValueError, RecursionError) as error:  # Recursion: a list in a list in a list ...
+                content = json.dumps(answer(ask)).encode()
+        except (ValueError, OSError, RecursionError) as error:  # Recursion: lists in one another
             return self.answer(400, str(error))
-        self.answer(200, json.dumps(answer).encode(), "application/json")
+        self.answer(200, content, "application/json")
 
-    def foreign(self) -> bool:
-        """Refuse a request that another site's page may have made."""
-        hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
-        ours = len(hosts) == 1 and hosts[0] in self.server.hosts
-        if ours and set(origins) <= {f"http://{host}" for host in self.server.hosts}:
-            return False
-        self.answer(403, f"this server talks to its own page alone, at {self.server.hosts[0]}")
-        return True
-
-    def body(self) -> bytes:
-        """What was sent. Raises ValueError if its length is not given, or too great."""
-        length = self.headers.get("Content-Length", "")
-        if not (length.isascii() and length.isdigit() and len(length) < 9):
-            raise ValueError("a request needs a Content-Length")
-        if int(length) > LARGEST:
-            raise ValueError(f"a request has {LARGEST} bytes at most")
-        return self.rfile.read(int(length))
-
-    def answer(self, code: int, text: bytes | str, kind: str = "text/plain") -> None:
+    def answer(self, code: int, content: bytes | str, kind: str = "text/plain") -> None:
         """Send an answer; all but 200 are one line, and the last of their connection."""
-        if isinstance(text, str):
-            line = "".join(x if x.isprintable() else "?" for x in text)[:300]
-            text = f"{line}\n".encode("ascii", "backslashreplace")
+        if isinstance(content, str):
+            content = f"{ascii(content[:300])[1:-1]}\n".encode()
+        more = {"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(content))}
+        more |= {} if code == 200 else {"Connection": "close"}
         self.send_response(code)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(text)))
-        self.send_header("Content-Security-Policy", POLICY)
-        self.send_header("X-Content-Type-Options", "nosniff")
-        self.send_header("Cache-Control", "no-store")
-        if code != 200:
-            self.send_header("Connection", "close")
+        for name, value in (HEADERS | more).items():
+            self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(text)
+        self.wfile.write(content)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """What http.server itself cannot read is a malformed request too."""
@@ -132,54 +101,41 @@ class Handler(BaseHTTPRequestHandler):
         """Hang up, but hear out what is still being sent, or the answer may not arrive."""
         super().finish()
         with suppress(OSError):
-            self.connection.shutdown(socket.SHUT_WR)
             self.connection.settimeout(1)  # s
-            while self.connection.recv(2**16):
-                pass
+            self.connection.recv(LARGEST, socket.MSG_WAITALL)
 
     def log_message(self, *args: Any) -> None:
         """Be silent: ten lines a second help nobody."""
 
 
-def free_port(taken: int) -> int:
-    """The next port where a server could listen. Raises ValueError if there is none."""
-    for port in range(taken + 1, 2**16):
-        with socket.socket() as trial, suppress(OSError):
-            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as http.server does
-            trial.bind((HOST, port))
-            return port
-    raise ValueError(f"port {taken} is taken, and so are all above it")
+def listen(port: int, hangar: Any) -> Server:
+    """Take the port. Raises ValueError, which names the next free one, if that cannot be."""
+    for free in range(port if port >= 0 else 2**16, 2**16):
+        with suppress(OSError):
+            server = Server(free, hangar)
+            if free == port:
+                return server
+            raise ValueError(f"port {port} is taken: --port {free} is free")
+    raise ValueError(f"port is {port}, allowed are whole numbers below {2**16} of a free port")
 
 
-def listen(argv: Sequence[str] | None) -> Server:
-    """Read the command line, and take the port. Raises ValueError."""
-    parser = Parser(prog="extras.cockpit", description="Fly a drone, and ask the network why.")
-    help_text = "of the page's address; 0: any free one; default: %(default)s"
-    parser.add_argument("--port", type=int, default=PORT, metavar="N", help=help_text)
-    port = whole_number("port", parser.parse_args(argv).port, 2**16 - 1)
-    torch.set_num_threads(1)  # as quick as two for so few pictures, and two would share the work
-    try:
-        return Server(port, Hangar())
-    except OSError as error:
-        taken = error.errno == errno.EADDRINUSE
-        hint = f"is taken: --port {free_port(port)} is free" if taken else error.strerror
-        raise ValueError(f"port {port} {hint}") from None
-
-
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: list[str] | None = None) -> int:
     """Serve until Ctrl-C. Returns the exit code: 130, as a shell expects then; 2 for bad input."""
-    try:
-        if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        server = listen(argv)
-        say(f"the cockpit is at http://{HOST}:{server.server_port}/ (Ctrl-C ends it)")
+    try:  # the imports too, because torch takes seconds
+        from deepflight import Parser
+        from extras.cockpit.flights import Hangar
+
+        parser = Parser(prog="extras.cockpit", description="Fly a drone, and ask the network why.")
+        parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"default: {PORT}")
+        server = listen(parser.parse_args(argv).port, Hangar())
+        print(f"the cockpit is at {server.ours[0]}/ (Ctrl-C ends it)", flush=True)
         server.serve_forever()
     except KeyboardInterrupt:
-        say("\nthe cockpit is closed")
+        print("\nthe cockpit is closed", file=sys.stderr)
     except ValueError as error:
-        say(f"extras.cockpit: error: {error}", file=sys.stderr)
+        print(f"extras.cockpit: error: {error}", file=sys.stderr)
         return 2
-    return 128 + signal.SIGINT
+    return 130
 
 
 if __name__ == "__main__":

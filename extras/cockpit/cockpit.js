@@ -11,10 +11,8 @@ let ghost = null; // another one through the same forest, and its label
 let t = 0; // the moment on show
 let reasons = null; // the answer to "why", of moment t
 let removed = null; // the one of reasons.without that is looked at
-let playing = false;
-let busy = false; // a step is on its way
-let generation = 0; // of the flight on show: what was asked about an older one is dropped
-let loops = 0; // of the player: a pause ends its loop, even if another one begins at once
+let [playing, busy] = [false, false]; // busy: a step is on its way
+let [generation, loops] = [0, 0]; // of flights and players: what an older one waited for is dropped
 let later = 0; // the timer that writes the address
 const landed = []; // flights that were flown by hand to their end
 const stick = { held: {}, tapped: {}, side: 0, level: 0 };
@@ -30,11 +28,10 @@ const clock = (moment) => `${(moment * world().dt).toFixed(1)} s`;
 const say = (text) => ($("hint").textContent = text);
 
 // -------------------------------------------------- the server
-
 async function post(path, content) {
   const answer = await fetch(path, { method: "POST", body: JSON.stringify(content) });
-  if (!answer.ok) throw new Error((await answer.text()).trim());
-  return answer.json();
+  if (answer.ok) return answer.json();
+  throw new Error((await answer.text()).trim());
 }
 
 function ask(path, more) {
@@ -43,13 +40,10 @@ function ask(path, more) {
 }
 
 // Fly these actions, then let the pilot fly `more` steps, and add what is not known yet.
-async function extend(to, actions, more = 0, pilot = "network", pictures = "0") {
+async function extend(to, actions, more = 0, pilot = "network") {
   const since = String(to.moments.length);
-  const answer = await ask("/fly", { actions, pilot, more: String(more), since, pictures });
-  to.moments.push(...answer.moments);
-  return Object.assign(to, {
-    record: answer.flight, actions: answer.flight.actions, ended: answer.ended, trunks: answer.trunks || to.trunks,
-  });
+  const answer = await ask("/fly", { actions, pilot, more: String(more), since });
+  return Object.assign(to, answer, { moments: [...to.moments, ...answer.moments], actions: answer.record.actions });
 }
 
 // Whether it went well. What fails is told in a line.
@@ -59,28 +53,27 @@ async function attempt(action) {
     return true;
   } catch (error) {
     pause();
-    say(error instanceof TypeError ? `The server does not answer, or: ${error.message}` : error.message);
+    say(error instanceof TypeError ? `The server does not answer: ${error.message}` : error.message);
     return false;
   }
 }
 
 // -------------------------------------------------- flights
-
 async function begin(actions, moment) {
   const me = ++generation;
   pause();
-  const found = await extend({ moments: [] }, actions, 0, "network", "1");
+  const found = await extend({ moments: [] }, actions);
   if (me !== generation) return;
   [flight, ghost] = [found, null];
   drawForest();
-  forget();
+  setReasons(null);
   show(Math.min(moment || 0, end()));
   if (!byHand() || over()) say("Drag the time line. Click a trunk or a bar to ask the network. Or take over, and do better.");
   else if (actions) say("You have the controls: ← or → fly on from here, space flies straight on.");
   else say("Press ← or → to take off. Hold to turn harder. The network flies along as a ghost.");
   if (!byHand() && moment === null) play();
   while (!byHand() && !over()) {
-    await extend(found, found.actions, 25, chosen.pilot, "1");
+    await extend(found, found.actions, 25, chosen.pilot);
     if (me !== generation) return;
     show(playing || t >= moment ? t : Math.min(moment, end()));
   }
@@ -95,7 +88,7 @@ async function steer() {
   if (busy) return;
   busy = true;
   const [me, start] = [generation, performance.now()];
-  await extend(flight, flight.actions + turn(), 0, "network", "1").finally(() => (busy = false));
+  await extend(flight, flight.actions + turn()).finally(() => (busy = false));
   if (me !== generation) return;
   show(end());
   requestAnimationFrame(() => performance.measure("step to picture", { start }));
@@ -147,27 +140,24 @@ function wentWrong() {
 }
 
 // -------------------------------------------------- why
-
 async function why(trunk = null) {
   pause();
   const [me, at] = [generation, t];
   const answer = reasons || (await ask("/why", { actions: flight.actions, time: String(at) }));
   if (me !== generation || at !== t) return;
-  reasons = answer;
-  removed = reasons.without.find((x) => x.trunk === trunk) || null;
+  setReasons(answer, trunk);
   draw();
-  drawTrunks();
-  drawReasons();
   if (trunk !== null && !removed) say("That is in none of the four pictures: without it nothing would change.");
 }
 
-function forget() {
-  reasons = removed = null;
-  $("answer").replaceChildren();
+function setReasons(answer, trunk = null) {
+  reasons = answer;
+  removed = (answer && answer.without.find((x) => x.trunk === trunk)) || null;
+  $("answer").replaceChildren(...(answer ? describeReasons() : []));
   drawTrunks();
 }
 
-function drawReasons() {
+function describeReasons() {
   const text = document.createElement("p");
   text.innerHTML = `It would turn <b>${rate(reasons.chosen)}</b> rad/s. How much this turn's lead over the mean Q owes
     to each thing in view: <span class="for">a reason for it</span>, <span class="against">a reason against</span>.`;
@@ -180,7 +170,7 @@ function drawReasons() {
     button.className = x.weight > 0 ? "for" : "against";
     button.setAttribute("aria-pressed", x === removed);
   }
-  $("answer").replaceChildren(text, row);
+  return [text, row];
 }
 
 function whereabouts([x, y]) {
@@ -198,7 +188,6 @@ function clickMap(event) {
 }
 
 // -------------------------------------------------- play
-
 function play() {
   if (playing) return;
   playing = true;
@@ -232,14 +221,13 @@ function stepTo(moment) {
 }
 
 function show(moment) {
-  if (moment !== t && reasons) forget();
+  if (moment !== t && reasons) setReasons(null);
   t = moment;
   draw();
   if (!playing) remember();
 }
 
 // -------------------------------------------------- drawing
-
 function rate(action) {
   const x = world().yaw_rate * (action / straight() - 1);
   return x === 0 ? "0" : (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).slice(1);
@@ -348,23 +336,22 @@ function drawCurves() {
 }
 
 function drawTable() {
+  const yes = (x) => (x ? "yes" : "no");
   const rows = {
     steps: (x) => x.steps,
-    crossed: (x) => x.outcome === "goal" || x.edge === "far",
-    crashed: (x) => x.outcome === "crash",
-    arrived: (x) => x.outcome === "goal",
+    crossed: (x) => yes(x.outcome === "goal" || x.edge === "far"),
+    crashed: (x) => yes(x.outcome === "crash"),
+    arrived: (x) => yes(x.outcome === "goal"),
     "total reward": (x) => number(x.return),
   };
-  const text = (x) => ({ true: "yes", false: "no" })[x] || x;
   const flights = [{ ...flight, label: chosen.pilot }, ghost].filter(Boolean);
-  const cell = (f, row) => (f.ended && (over() || f.whole) ? text(row(f.record)) : "…");
-  const line = (name, cells, kind) => `<tr><th scope="row">${name}</th>${cells.map((x) => `<${kind}>${x}</${kind}>`).join("")}</tr>`;
-  const body = Object.entries(rows).map(([name, row]) => line(name, flights.map((f) => cell(f, row)), "td"));
-  $("table").innerHTML = line("", flights.map((f) => f.label), "th") + body.join("");
+  const line = (name, cells) => `<tr><th scope="row">${name}</th>${cells.map((x) => `<td>${x}</td>`).join("")}</tr>`;
+  const known = (f) => f.ended && (over() || f.whole);
+  const body = Object.entries(rows).map(([name, row]) => line(name, flights.map((f) => (known(f) ? row(f.record) : "…"))));
+  $("table").innerHTML = line("", flights.map((f) => `<b>${f.label}</b>`)) + body.join("");
 }
 
 // -------------------------------------------------- choices, address, file
-
 function addButton(parent, text, action) {
   const button = parent.appendChild(document.createElement("button"));
   button.textContent = text;
@@ -378,9 +365,9 @@ async function choose(change, actions = "", moment = null) {
   if (!world().weights.includes(chosen.weights)) chosen.weights = world().weights[0];
   drawChoices();
   const well = await attempt(() => begin(actions, moment));
-  if (well || !flight) return well;
-  chosen = before;
+  if (!well && flight) chosen = before;
   drawChoices();
+  return well;
 }
 
 function drawChoices() {
@@ -389,14 +376,14 @@ function drawChoices() {
     const row = $(`${key}s`);
     if (!row.children.length) all.forEach((name) => addButton(row, name, () => choose({ [key]: name })));
     for (const button of row.children) set(button, { "aria-pressed": button.textContent === chosen[key] });
+    if (key === "world") all.forEach((name, i) => (row.children[i].disabled = !options.worlds[name].weights.length));
   }
   $("weights").replaceChildren(...world().weights.map((name) => new Option(name, name, false, name === chosen.weights)));
   $("seed").value = chosen.seed;
 }
 
 function writeAddress() {
-  const { actions } = flight;
-  history.replaceState(null, "", `#${new URLSearchParams({ ...chosen, t, actions })}`);
+  history.replaceState(null, "", `#${new URLSearchParams({ ...chosen, t, actions: flight.actions })}`);
 }
 
 // Browsers complain if the address changes many times a second.
@@ -407,13 +394,12 @@ function remember() {
 
 async function restore() {
   const told = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
-  const first = { pilot: "you", world: Object.keys(options.worlds)[0], seed: "1" };
-  const known = { pilot: options.pilots.includes(told.pilot), world: told.world in options.worlds, seed: told.seed };
-  const change = Object.fromEntries(Object.keys(first).map((key) => [key, known[key] ? told[key] : first[key]]));
-  const moment = Math.trunc(Math.abs(Number(told.t))) || 0;
-  if (await choose({ ...change, weights: told.weights }, told.actions, moment) || flight) return;
+  const first = { pilot: "you", world: Object.keys(options.worlds)[0], seed: told.seed || "1", weights: told.weights };
+  if (options.pilots.includes(told.pilot)) first.pilot = told.pilot;
+  if (told.world in options.worlds && options.worlds[told.world].weights.length) first.world = told.world;
+  if (await choose(first, told.actions, Math.trunc(Math.abs(Number(told.t))) || 0) || flight) return;
   const wrong = $("hint").textContent;
-  if (await choose(first)) say(wrong);
+  if (await choose({ seed: "1" })) say(wrong);
 }
 
 async function share() {
@@ -435,7 +421,6 @@ function save() {
 }
 
 // -------------------------------------------------- keys and buttons
-
 const actions = {
   play: () => (playing ? pause() : play()),
   back: () => stepTo(t - 1),

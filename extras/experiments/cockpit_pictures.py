@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from PIL import Image
 from selenium import webdriver
 from selenium.common.exceptions import JavascriptException
@@ -40,10 +39,9 @@ FLAGS = (
 @contextmanager
 def serving() -> Iterator[str]:
     """A cockpit at any free port; its address."""
-    torch.set_num_threads(1)
     server = Server(0, Hangar())
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield server.hosts[0]
+    yield f"127.0.0.1:{server.server_port}"
     server.shutdown()
     server.server_close()
 
