@@ -6,11 +6,10 @@ const $ = (id) => document.getElementById(id);
 const PIXELS = 84;
 let options; // what one may choose from, and the numbers of each world
 let chosen = {}; // world, weights, seed, pilot
-let flight = null; // the flight on show: moments, record, actions, ended, trunks
+let flight = null; // the flight on show: choice, moments, record, actions, ended, trunks
 let ghost = null; // another one through the same forest, and its label
 let t = 0; // the moment on show
-let reasons = null; // the answer to "why", of moment t
-let removed = null; // the one of reasons.without that is looked at
+let [reasons, removed] = [null, null]; // the answer to "why" of moment t; what is taken out on show
 let [playing, busy] = [false, false]; // busy: a step is on its way
 let [generation, loops] = [0, 0]; // of flights and players: what an older one waited for is dropped
 let later = 0; // the timer that writes the address
@@ -23,7 +22,6 @@ const over = () => flight.ended !== "";
 const byHand = () => chosen.pilot === "you";
 const straight = () => (world().actions - 1) / 2;
 const number = (x) => x.toFixed(1).replace("-", "−");
-const signed = (x) => (x < 0 ? "" : "+") + number(x);
 const clock = (moment) => `${(moment * world().dt).toFixed(1)} s`;
 const say = (text) => ($("hint").textContent = text);
 
@@ -34,15 +32,12 @@ async function post(path, content) {
   throw new Error((await answer.text()).trim());
 }
 
-function ask(path, more) {
-  const { world, weights, seed } = chosen;
-  return post(path, { world, weights, seed, ...more });
-}
+const ask = (path, { world, weights, seed }, more) => post(path, { world, weights, seed, ...more });
 
 // Fly these actions, then let the pilot fly `more` steps, and add what is not known yet.
 async function extend(to, actions, more = 0, pilot = "network") {
   const since = String(to.moments.length);
-  const answer = await ask("/fly", { actions, pilot, more: String(more), since });
+  const answer = await ask("/fly", to.choice, { actions, pilot, more: String(more), since });
   return Object.assign(to, answer, { moments: [...to.moments, ...answer.moments], actions: answer.record.actions });
 }
 
@@ -62,7 +57,7 @@ async function attempt(action) {
 async function begin(actions, moment) {
   const me = ++generation;
   pause();
-  const found = await extend({ moments: [] }, actions);
+  const found = await extend({ choice: chosen, moments: [] }, actions);
   if (me !== generation) return;
   [flight, ghost] = [found, null];
   drawForest();
@@ -78,7 +73,7 @@ async function begin(actions, moment) {
     show(playing || t >= moment ? t : Math.min(moment, end()));
   }
   if (chosen.pilot === "network") return;
-  const other = await extend({ label: "network", moments: [] }, "", world().max_steps);
+  const other = await extend({ choice: chosen, label: "network", moments: [] }, "", world().max_steps);
   if (me !== generation) return;
   ghost = ghost || other;
   show(t);
@@ -93,7 +88,7 @@ async function steer() {
   show(end());
   requestAnimationFrame(() => performance.measure("step to picture", { start }));
   if (!over()) return;
-  landed.push({ world: chosen.world, ...flight.record });
+  landed.push({ world: flight.choice.world, ...flight.record });
   pause();
   say(`You: ${flight.ended}. R flies this forest again, N the next one. Or drag the time line, and ask why.`);
 }
@@ -108,8 +103,9 @@ function turn() {
 
 function hold(side, down) {
   stick.held[side] = down ? 1 : 0;
-  if (!down || over()) return;
+  if (!down) return;
   if (!byHand() || t < end()) return say("To steer from this moment on, press Take over here.");
+  if (over()) return say("This flight is over. R flies the forest again, N the next one.");
   stick.tapped[side] = 1;
   play();
 }
@@ -117,8 +113,8 @@ function hold(side, down) {
 async function whatIf(action) {
   pause();
   const [me, from] = [generation, t];
-  const label = `what if ${rate(action)} at ${clock(from)}`;
-  const other = { label, moments: flight.moments.slice(0, from), actions: flight.actions.slice(0, from), whole: true };
+  const other = { ...flight, label: `what if ${rate(action)} at ${clock(from)}`, whole: true, ended: "" };
+  [other.moments, other.actions] = [flight.moments.slice(0, from), flight.actions.slice(0, from)];
   // The turn may end the flight, and no action can follow that.
   for (let i = 0; i < Number($("hold").value) && !other.ended; i++) await extend(other, other.actions + action);
   await extend(other, other.actions, world().max_steps);
@@ -143,7 +139,7 @@ function wentWrong() {
 async function why(trunk = null) {
   pause();
   const [me, at] = [generation, t];
-  const answer = reasons || (await ask("/why", { actions: flight.actions, time: String(at) }));
+  const answer = reasons || (await ask("/why", flight.choice, { actions: flight.actions, time: String(at) }));
   if (me !== generation || at !== t) return;
   setReasons(answer, trunk);
   draw();
@@ -166,9 +162,9 @@ function describeReasons() {
   const strongest = [...reasons.without].sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight));
   for (const x of strongest.slice(0, 8)) {
     const name = x.trunk < 0 ? "the goal's pole" : `trunk ${whereabouts(flight.trunks[x.trunk])}`;
-    const button = addButton(row, `${name} ${signed(x.weight)}`, () => attempt(() => why(x === removed ? null : x.trunk)));
-    button.className = x.weight > 0 ? "for" : "against";
-    button.setAttribute("aria-pressed", x === removed);
+    const weight = (x.weight < 0 ? "" : "+") + number(x.weight);
+    const button = addButton(row, `${name} ${weight}`, () => attempt(() => why(x === removed ? null : x.trunk)));
+    set(button, { class: x.weight > 0 ? "for" : "against", "aria-pressed": x === removed });
   }
   return [text, row];
 }
@@ -317,8 +313,7 @@ function drawBars() {
     [before.style.height, without.style.height, without.hidden] = [height(q[a]), height(other ? other[a] : low), !other];
     bar.classList.toggle("best", q[a] === Math.max(...q));
     bar.classList.toggle("flown", flight.actions[t] === String(a));
-    const changed = other ? `, without it ${number(other[a])}` : "";
-    set(bar, { "aria-label": `${rate(a)} radians a second: Q ${number(q[a])}${changed}. What if it turned so?` });
+    set(bar, { "aria-label": `${rate(a)} radians a second: Q ${number(q[a])}. What if it turned so?` });
   });
 }
 
@@ -360,12 +355,11 @@ function addButton(parent, text, action) {
 }
 
 async function choose(change, actions = "", moment = null) {
-  const before = chosen;
-  chosen = { ...chosen, ...change };
-  if (!world().weights.includes(chosen.weights)) chosen.weights = world().weights[0];
+  const after = (chosen = { ...chosen, ...change });
+  chosen.weights ||= world().weights[0];
   drawChoices();
   const well = await attempt(() => begin(actions, moment));
-  if (!well && flight) chosen = before;
+  if (!well && flight && chosen === after) chosen = flight.choice;
   drawChoices();
   return well;
 }
@@ -374,7 +368,7 @@ function drawChoices() {
   const names = { pilot: options.pilots, world: Object.keys(options.worlds) };
   for (const [key, all] of Object.entries(names)) {
     const row = $(`${key}s`);
-    if (!row.children.length) all.forEach((name) => addButton(row, name, () => choose({ [key]: name })));
+    if (!row.children.length) all.forEach((name) => addButton(row, name, () => choose(key === "world" ? { world: name, weights: "" } : { pilot: name })));
     for (const button of row.children) set(button, { "aria-pressed": button.textContent === chosen[key] });
     if (key === "world") all.forEach((name, i) => (row.children[i].disabled = !options.worlds[name].weights.length));
   }
@@ -383,7 +377,7 @@ function drawChoices() {
 }
 
 function writeAddress() {
-  history.replaceState(null, "", `#${new URLSearchParams({ ...chosen, t, actions: flight.actions })}`);
+  history.replaceState(null, "", `#${new URLSearchParams({ ...flight.choice, t, actions: flight.actions })}`);
 }
 
 // Browsers complain if the address changes many times a second.
@@ -399,7 +393,7 @@ async function restore() {
   if (told.world in options.worlds && options.worlds[told.world].weights.length) first.world = told.world;
   if (await choose(first, told.actions, Math.trunc(Math.abs(Number(told.t))) || 0) || flight) return;
   const wrong = $("hint").textContent;
-  if (await choose({ seed: "1" })) say(wrong);
+  if (await choose({ seed: "1", weights: "" })) say(wrong);
 }
 
 async function share() {
