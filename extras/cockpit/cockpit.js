@@ -12,7 +12,7 @@ let t = 0; // the moment on show
 let [reasons, removed] = [null, null]; // the answer to "why" of moment t; what is taken out on show
 let [playing, busy] = [false, false]; // busy: a step is on its way
 let [generation, loops] = [0, 0]; // of flights and players: what an older one waited for is dropped
-let later = 0; // the timer that writes the address
+let later; // the timer that writes the address
 const landed = []; // flights that were flown by hand to their end
 const stick = { held: {}, tapped: {}, side: 0, level: 0 };
 
@@ -23,6 +23,9 @@ const byHand = () => chosen.pilot === "you";
 const straight = () => (world().actions - 1) / 2;
 const number = (x) => x.toFixed(1).replace("-", "−");
 const clock = (moment) => `${(moment * world().dt).toFixed(1)} s`;
+const signed = (x) => (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).replace(/^0/, "");
+const rate = (action) => signed(world().yaw_rate * (action / straight() - 1)); // rad/s
+const set = (node, values) => Object.entries(values).forEach(([key, x]) => node.setAttribute(key, x)) || node;
 const say = (text) => ($("hint").textContent = text);
 
 // -------------------------------------------------- the server
@@ -49,7 +52,6 @@ async function attempt(action) {
   } catch (error) {
     pause();
     say(error instanceof TypeError ? `The server does not answer: ${error.message}` : error.message);
-    return false;
   }
 }
 
@@ -121,7 +123,7 @@ async function whatIf(action) {
   if (me !== generation) return;
   ghost = other;
   show(from);
-  say(`With ${rate(action)} rad/s from ${clock(from)} on it would have: ${other.ended}, total reward ${number(other.record.return)}.`);
+  say(`The dashed way, ${other.label}: ${other.ended}, total reward ${number(other.record.return)}.`);
 }
 
 // The greatest Q is what the network expects from here on. Where it falls most, it was surprised.
@@ -154,16 +156,14 @@ function setReasons(answer, trunk = null) {
 }
 
 function describeReasons() {
-  const text = document.createElement("p");
+  const [text, row] = [document.createElement("p"), document.createElement("div")];
   text.innerHTML = `It would turn <b>${rate(reasons.chosen)}</b> rad/s. How much this turn's lead over the mean Q owes
     to each thing in view: <span class="for">a reason for it</span>, <span class="against">a reason against</span>.`;
-  const row = document.createElement("div");
   row.className = "row";
   const strongest = [...reasons.without].sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight));
   for (const x of strongest.slice(0, 8)) {
     const name = x.trunk < 0 ? "the goal's pole" : `trunk ${whereabouts(flight.trunks[x.trunk])}`;
-    const weight = (x.weight < 0 ? "" : "+") + number(x.weight);
-    const button = addButton(row, `${name} ${weight}`, () => attempt(() => why(x === removed ? null : x.trunk)));
+    const button = addButton(row, `${name} ${signed(x.weight)}`, () => attempt(() => why(x === removed ? null : x.trunk)));
     set(button, { class: x.weight > 0 ? "for" : "against", "aria-pressed": x === removed });
   }
   return [text, row];
@@ -184,17 +184,14 @@ function clickMap(event) {
 }
 
 // -------------------------------------------------- play
-function play() {
-  if (playing) return;
-  playing = true;
-  $("play").textContent = "Pause";
-  attempt(loop);
-}
+const play = () => playing || setPlaying(true);
+const pause = () => setPlaying(false);
 
-function pause() {
-  playing = false;
-  $("play").textContent = "Play";
-  remember();
+function setPlaying(on) {
+  playing = on;
+  $("play").textContent = on ? "Pause" : "Play";
+  if (on) attempt(loop);
+  else remember();
 }
 
 async function loop() {
@@ -224,32 +221,23 @@ function show(moment) {
 }
 
 // -------------------------------------------------- drawing
-function rate(action) {
-  const x = world().yaw_rate * (action / straight() - 1);
-  return x === 0 ? "0" : (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).slice(1);
-}
-
-function set(node, values) {
-  for (const [key, x] of Object.entries(values)) node.setAttribute(key, x);
-  return node;
-}
-
 function drawForest() {
-  const { length, width, back, goal_radius, actions } = world();
+  const { length, width, back, actions } = world();
   set($("map"), { viewBox: `-4 ${-width / 2 - 2} ${length + 8} ${width + 4}` });
   set($("ground"), { x: -back, y: -width / 2, width: length + back, height: width });
-  set($("goal"), { cx: length, cy: 0, r: goal_radius });
+  set($("goal"), { cx: length, cy: 0 });
   const circle = ([cx, y]) => set(document.createElementNS("http://www.w3.org/2000/svg", "circle"), { cx, cy: -y });
   $("trunks").replaceChildren(...flight.trunks.map(circle));
   for (let a = actions - 1; a >= 0 && $("bars").children.length < actions; a--) {
     const bar = addButton($("bars"), "", () => attempt(() => whatIf(a)));
-    bar.innerHTML = `<span></span><span class="well"><i></i><i class="other"></i></span>
-      <span class="rate">${rate(a)}</span><span class="after"></span>`;
+    bar.innerHTML = `<span></span><span class="well"><i></i><i class="other"></i></span><span class="rate">${rate(a)}</span><span class="after"></span>`;
   }
 }
 
 function draw() {
-  [drawPictures, drawMap, drawBars, drawCurves, drawTable].forEach((part) => part());
+  paint($("seen"), removed ? removed.frame : flight.moments[t].frame);
+  [...$("stack").children].forEach((canvas, i) => paint(canvas, flight.moments[Math.max(t - 3 + i, 0)].frame));
+  [drawMap, drawBars, drawCurves, drawTable].forEach((part) => part());
   $("time").max = end();
   $("time").value = t;
   set($("time"), { "aria-valuetext": clock(t) });
@@ -257,11 +245,6 @@ function draw() {
   const landing = t === end() && over() && `${flight.ended}, total reward ${number(flight.record.return)}`;
   const hint = byHand() && !end() && "← or → to take off";
   $("banner").textContent = removed ? `without ${removed.trunk < 0 ? "the goal's pole" : "this trunk"}` : landing || hint || "";
-}
-
-function drawPictures() {
-  paint($("seen"), removed ? removed.frame : flight.moments[t].frame);
-  [...$("stack").children].forEach((canvas, i) => paint(canvas, flight.moments[Math.max(t - 3 + i, 0)].frame));
 }
 
 function paint(canvas, frame) {
@@ -292,13 +275,13 @@ function drawMap() {
 function drawTrunks() {
   const found = new Map((reasons ? reasons.without : []).map((x) => [x.trunk, x]));
   const most = Math.max(...[...found.values()].map((x) => Math.abs(x.weight)), 1e-9);
-  const kind = (x) => (!x ? "" : x === removed ? "removed" : x.weight > 0 ? "for" : "against");
-  set($("goal"), { class: kind(found.get(-1)) });
-  [...$("trunks").children].forEach((circle, i) => {
-    const x = found.get(i);
+  const colour = (node, x, r) => {
     const share = x ? Math.abs(x.weight) / most : 0;
-    set(circle, { class: kind(x), r: world().trunk_radius * (1 + 1.5 * share), "fill-opacity": x ? 0.3 + 0.7 * share : 1 });
-  });
+    const kind = !x ? "" : x === removed ? "removed" : x.weight > 0 ? "for" : "against";
+    set(node, { class: kind, r: r * (1 + share), "fill-opacity": x ? 0.3 + 0.7 * share : 1 });
+  };
+  colour($("goal"), found.get(-1), world().goal_radius);
+  [...$("trunks").children].forEach((circle, i) => colour(circle, found.get(i), 1.2 * world().trunk_radius));
 }
 
 function drawBars() {
@@ -307,8 +290,7 @@ function drawBars() {
   const height = (x) => `${(100 * (x - low)) / Math.max(high - low, 1e-9)}%`;
   [...$("bars").children].forEach((bar, i) => {
     const a = q.length - 1 - i; // the sharpest left turn stands leftmost
-    const [value, well, , after] = bar.children;
-    const [before, without] = well.children;
+    const [value, { children: [before, without] }, , after] = bar.children;
     [value.textContent, after.textContent] = [number(q[a]), other ? number(other[a]) : ""];
     [before.style.height, without.style.height, without.hidden] = [height(q[a]), height(other ? other[a] : low), !other];
     bar.classList.toggle("best", q[a] === Math.max(...q));
@@ -376,15 +358,13 @@ function drawChoices() {
   $("seed").value = chosen.seed;
 }
 
-function writeAddress() {
-  history.replaceState(null, "", `#${new URLSearchParams({ ...flight.choice, t, actions: flight.actions })}`);
-}
-
-// Browsers complain if the address changes many times a second.
 function remember() {
-  clearTimeout(later);
+  clearTimeout(later); // browsers complain if the address changes many times a second
   later = setTimeout(() => flight && writeAddress(), 150);
 }
+
+const address = () => new URLSearchParams({ ...flight.choice, t, actions: flight.actions });
+const writeAddress = () => history.replaceState(null, "", `#${address()}`);
 
 async function restore() {
   const told = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
