@@ -132,7 +132,7 @@ def main(argv: list[str] | None = None) -> int:
         server.serve_forever()
     except KeyboardInterrupt:
         print("\nthe cockpit is closed", file=sys.stderr)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         print(f"extras.cockpit: error: {error}", file=sys.stderr)
         return 2
     return 130
