@@ -8,11 +8,10 @@ let options; // what one may choose from, and the numbers of each world
 let chosen = {}; // world, weights, seed, pilot
 let flight = null; // the flight on show: choice, moments, record, actions, ended, trunks
 let ghost = null; // another one through the same forest, and its label
-let t = 0; // the moment on show
+let [t, later] = [0, 0]; // the moment on show; the timer that writes the address
 let [reasons, removed] = [null, null]; // the answer to "why" of moment t; what is taken out on show
 let [playing, busy] = [false, false]; // busy: a step is on its way
 let [generation, loops] = [0, 0]; // of flights and players: what an older one waited for is dropped
-let later; // the timer that writes the address
 const landed = []; // flights that were flown by hand to their end
 const stick = { held: {}, tapped: {}, side: 0, level: 0 };
 
@@ -21,7 +20,7 @@ const end = () => flight.moments.length - 1;
 const over = () => flight.ended !== "";
 const byHand = () => chosen.pilot === "you";
 const straight = () => (world().actions - 1) / 2;
-const number = (x) => x.toFixed(1).replace("-", "−");
+const number = (x) => (Math.round(10 * x) / 10 || 0).toFixed(1).replace("-", "−"); // never −0.0
 const clock = (moment) => `${(moment * world().dt).toFixed(1)} s`;
 const signed = (x) => (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).replace(/^0/, "");
 const rate = (action) => signed(world().yaw_rate * (action / straight() - 1)); // rad/s
@@ -315,6 +314,7 @@ function drawCurves() {
 function drawTable() {
   const yes = (x) => (x ? "yes" : "no");
   const rows = {
+    end: (x, ended) => ended,
     steps: (x) => x.steps,
     crossed: (x) => yes(x.outcome === "goal" || x.edge === "far"),
     crashed: (x) => yes(x.outcome === "crash"),
@@ -324,7 +324,7 @@ function drawTable() {
   const flights = [{ ...flight, label: chosen.pilot }, ghost].filter(Boolean);
   const line = (name, cells) => `<tr><th scope="row">${name}</th>${cells.map((x) => `<td>${x}</td>`).join("")}</tr>`;
   const known = (f) => f.ended && (over() || f.whole);
-  const body = Object.entries(rows).map(([name, row]) => line(name, flights.map((f) => (known(f) ? row(f.record) : "…"))));
+  const body = Object.entries(rows).map(([name, row]) => line(name, flights.map((f) => (known(f) ? row(f.record, f.ended) : "…"))));
   $("table").innerHTML = line("", flights.map((f) => `<b>${f.label}</b>`)) + body.join("");
 }
 

@@ -5,9 +5,10 @@ seed and actions say which flight is meant, because a flight is its seed and its
 few flights stay in memory, so that the next step costs one step.
 
 Legend
-    N  trunks; near of them may be in view
-    R  things that are taken out of a decision, one at a time: first nothing, then trunks, then the
-       goal's pole
+    A  actions
+    N  trunks
+    K  those of them that may be in view
+    R  states of one decision: as it was, without each of K trunks, and without the goal's pole
 
 Not in this file: HTTP, which is in __main__.py. No rule of the world either: they are env.py's.
 """
@@ -45,7 +46,7 @@ class Flight(Fleet):
     def note(self, r: float) -> None:
         """Keep all that there is to show of the moment after a step of reward r."""
         s = self.drone.observation  # (4, 84, 84)
-        q = self.q(torch.from_numpy(s[None]))[0].tolist()
+        q = self.q(torch.from_numpy(s[None]))[0].tolist()  # A numbers
         seen = {"frame": b64encode(s[-1]).decode(), "q": q, "reward": r, "return": self.drone.total}
         self.moments.append(self.drone.info() | seen)
 
@@ -60,7 +61,7 @@ PILOTS |= {"laser": laser_pilot(DQNConfig.gamma), "random": chance, "straight": 
 
 # -------------------------------------------------- what may be asked
 
-# As patterns. Of two more is asked: weights must have their name in a list, and actions must fly.
+# As patterns. That is not all: weights must have their name in a list, and actions must fly.
 LEGAL = dict.fromkeys(("more", "since", "time"), "[0-9]{1,4}")
 LEGAL |= {"world": "|".join(WORLDS), "pilot": "|".join(PILOTS), "seed": "[0-9]{1,18}"}
 LEGAL |= {"weights": ".{1,300}", "actions": f"[0-{World.actions - 1}]{{0,{World.max_steps}}}"}
@@ -149,7 +150,7 @@ class Hangar:
             raise ValueError(f"time is {t}, and the flight has {len(flight.moments) - 1} steps")
         last = [flight.moments[max(t - k, 0)]["pose"] for k in reversed(range(STACK))]
         names, states = without(np.array(last), flight)  # (R,), (R, 4, 84, 84)
-        changed = np.flatnonzero((states != states[0]).any((1, 2, 3)))  # those that are in view
+        changed = np.flatnonzero((states != states[0]).any((1, 2, 3)))  # of R: what is in view
         before, *after = flight.q(torch.from_numpy(states[[0, *changed]])).tolist()
         chosen = int(np.argmax(before))
         lead = [q[chosen] - float(np.mean(q)) for q in (before, *after)]
@@ -169,10 +170,13 @@ def without(poses: ndarray, flight: Flight) -> tuple[list[int], ndarray]:
     """
     trunks, world = flight.drone.trunks, flight.drone.world
     ahead, left = np.stack([seen_from(pose, trunks) for pose in poses]).T  # (N, 4), (N, 4) m
-    near = np.flatnonzero(((ahead > 0) & (abs(left) < ahead + 2 * world.trunk_radius)).any(1))
-    forests = [trunks, *(np.delete(trunks, i, 0) for i in near)]  # each (N, 2) or (N - 1, 2)
+    # As `camera` does it: two radii to spare, because a trunk is wide.
+    inside = (ahead > 0) & (ahead < world.view) & (abs(left) < ahead + 2 * world.trunk_radius)
+    near = np.flatnonzero(inside.any(1))  # (K,)
+    forests = [trunks, *(np.delete(trunks, i, 0) for i in near)]  # 1 + K of (N, 2), (N - 1, 2) m
     goal = flight.drone.goal if world.beacon else None
-    eyes = np.tile(poses, (len(forests), 1))  # (4 * (near + 1), 3)
-    seen = [forest for forest in forests for _ in poses]
+    # (4 + 4 K, 3), and as many forests: one for each eye
+    eyes, seen = np.tile(poses, (len(forests), 1)), [f for f in forests for _ in poses]
+    # In a world without a pole the last state equals the first, and so is left out.
     frames = [camera(eyes, seen, world, goal), camera(poses, [trunks] * STACK, world)]
     return [-2, *near, -1], np.concatenate(frames).reshape(-1, *flight.drone.observation.shape)
