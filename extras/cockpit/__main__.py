@@ -32,7 +32,8 @@ HEADERS["Content-Security-Policy"] = "default-src 'self'; img-src data:; frame-a
 
 
 class Server(ThreadingHTTPServer):
-    """Each connection has a thread, because browsers hold several open. Answers wait in line."""
+    """Answers what a flights.Hangar can. Each connection has a thread, because browsers hold many
+    open, and the questions wait in line."""
 
     def __init__(self, port: int, hangar: Any) -> None:
         super().__init__((HOST, port), Handler)

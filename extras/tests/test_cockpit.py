@@ -164,6 +164,17 @@ def test_weights_are_those_of_two_folders_and_each_has_its_world(tmp_path: Path)
     assert Hangar(tmp_path / "runs").options({})["worlds"]["disparity"]["weights"] == []
 
 
+def test_the_world_of_disparity_flies_once_it_has_weights(tmp_path: Path) -> None:
+    (tmp_path / "weights").mkdir()
+    save_weights(tmp_path / "weights/disparity.pt", QNetwork(9), beacon=False, camera="disparity")
+    flight = {"world": "disparity", "weights": "disparity", "seed": "1", "actions": "4567"}
+    hangar = Hangar(tmp_path)
+    moments = hangar.find(flight).moments
+    for moment, (s, *_) in zip(moments, refly(1, "4567", World(camera="disparity")), strict=True):
+        assert b64decode(moment["frame"]) == s[-1].tobytes()
+    assert hangar.why(flight | {"time": "4"})["before"] == pytest.approx(moments[4]["q"], abs=1e-4)
+
+
 @pytest.mark.parametrize("header", ["Host", "Origin"])
 @pytest.mark.parametrize("path", ["/", "/fly", "/options"])
 def test_other_sites_are_refused(server: Server, header: str, path: str) -> None:
