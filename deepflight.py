@@ -85,6 +85,7 @@ from env import OUTCOMES, Fleet, Flights, Pilot, World, fly, fly_random, measure
 TRAIN_END, TEST_FIRST, EVAL_FIRST = 10**9, 10**9, 2 * 10**9  # forest seeds
 TESTS = range(TEST_FIRST, TEST_FIRST + 48)  # the forests of a test point
 CORES = max(os.cpu_count() or 1, 8)  # the most threads that a setting may ask for
+PILOTS = ("random", "straight", "laser", "dqn")  # whom `eval` knows
 
 
 @dataclass(frozen=True)
@@ -364,34 +365,38 @@ def remember(replay: Replay, fleet: Fleet, a: list[int], c: DQNConfig, rc: RunCo
     replay.add(s, a, r, s2, terminated, truncated, scores)
 
 
-def read_demos(path: Path, beacon: bool) -> env.Record:
-    """The flights of a file that `eval --json` wrote. Raises ValueError unless they fly again as it
-    says, in this world, through forests of training's range."""
+def read_flights(path: Path, beacon: bool, last_seed: float = math.inf) -> Flights:
+    """The flights of a file that `eval --json` or the cockpit wrote. Raises ValueError unless they
+    fly again as it says, in this world, through forests up to `last_seed`."""
     if not os.path.isfile(path) or not 0 < os.path.getsize(path) <= dqn.LARGEST:
         raise ValueError(f"{path} is no file of flights, such as eval --json writes")
     try:
         report = json.loads(path.read_bytes())
-        flights = [flight for pilot in report["pilots"].values() for flight in pilot["flights"]]
-        demos = [(flight["seed"], flight["actions"]) for flight in flights]
+        written = [flight for pilot in report["pilots"].values() for flight in pilot["flights"]]
         if report["beacon"] is not beacon:
             raise ValueError(f"they are not of a world with beacon {beacon}")
-        dqn.check_like(demos, [(0, "")], "flights")
-        if not demos:
+        dqn.check_like([(f["seed"], f["actions"]) for f in written], [(0, "")], "flights")
+        if not written:
             raise ValueError("it holds no flights")
-        for i, flight in enumerate(flights):
-            show(f"checking demonstration {i + 1:,} of {len(demos):,}")
-            env.whole_number("seed", flight["seed"], TRAIN_END - 1)
-            steps = [*refly(*demos[i], World(), blind=True)]
-            *_, info = steps[-1]
-            same = info["outcome"] and info["outcome"] == flight["outcome"]
-            same = same and info["edge"] == flight["edge"]
-            if not (same and math.isclose(sum(r for _, r, *_ in steps), flight["return"])):
-                raise ValueError(f"flight {i + 1} does not fly again as it is written")
+        return [fly_again(i, flight, last_seed) for i, flight in enumerate(written, 1)]
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         other = getattr(error, "strerror", None) or "eval --json did not write it"
         why = error if isinstance(error, ValueError) else other
-        raise ValueError(f"{path} cannot be learnt from: {why}") from None
-    return demos
+        raise ValueError(f"{path} cannot be flown again: {why}") from None
+
+
+def fly_again(number: int, written: dict[str, Any], last_seed: float) -> dict[str, Any]:
+    """A flight of a file, flown again. Raises ValueError unless it ends as it is written."""
+    show(f"flying recorded flight {number:,}")
+    drone = env.ForestEnv(World(), blind=True)
+    drone.reset(seed=env.whole_number("seed", written["seed"], last_seed))
+    for action in written["actions"]:
+        drone.step(int(action))
+    flown = drone.flight()
+    same = flown["outcome"] and all(flown[key] == written[key] for key in ("outcome", "edge"))
+    if not (same and math.isclose(flown["return"], written["return"])):
+        raise ValueError(f"flight {number} does not fly again as it is written")
+    return flown
 
 
 # -------------------------------------------------- eval
@@ -404,18 +409,23 @@ def dqn_pilot(q: QNetwork) -> Pilot:
 
 def evaluate(args: argparse.Namespace) -> int:
     """Fly every pilot through the same forests; print the table, write JSON and a film."""
-    q, gif = load_pilot(args), args.out / "flight.gif"
+    (q, recorded), gif = load_pilot(args), args.out / "flight.gif"
     world, rng = World(beacon=args.beacon, camera=args.camera), np.random.default_rng(0)
     seeds = range(args.first_seed, args.first_seed + args.episodes)
+    seeds = [flight["seed"] for flight in recorded] or seeds
     pilots = {"straight": env.straight_pilot, "laser": env.laser_pilot(DQNConfig.gamma)}
     pilots["dqn"] = dqn_pilot(q)
     bar = fly_random(seeds, world, rng)
     flights: dict[str, Flights] = {}
     for p in args.pilots:
-        flights[p] = bar if p == "random" else fly(pilots[p], seeds, world, blind=p != "dqn")
+        if p in pilots:
+            flights[p] = fly(pilots[p], seeds, world, blind=p != "dqn")
+        else:
+            flights[p] = bar if p == "random" else recorded
     draws = rng.integers(len(seeds), size=(2000, len(seeds)))  # (2000, forests) resampled
     figures = {p: summarize(flights[p], bar, draws) for p in flights}
-    many = f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n"
+    where = "of the file, the first with" if recorded else "from"
+    many = f"{len(seeds)} forests {where} seed {seeds[0]}; 95 % intervals in [ ]\n"
     say(many if len(seeds) > 1 else f"1 forest, of seed {seeds[0]}\n")
     print_table(figures)
     if args.json:
@@ -424,6 +434,10 @@ def evaluate(args: argparse.Namespace) -> int:
         report["pilots"] = {p: figures[p] | {"flights": flights[p]} for p in flights}
         with dqn.whole_file(args.json) as file:
             file.write(json.dumps(report).encode())
+    failed = [f["seed"] for f in flights.get("dqn", []) if not measure([f])["crossed"][0]]
+    if failed:
+        say("\na flight of dqn that did not cross, in the cockpit (extras/README.md):")
+        say(cockpit(world, args.weights, failed[0]))
     say(f"\nwrote {args.json}" if args.json else "")
     shown = int(measure(flights[args.pilots[-1]])["crossed"].argmax())  # the first to cross, or 0
     with dqn.whole_file(gif) as file:
@@ -431,6 +445,17 @@ def evaluate(args: argparse.Namespace) -> int:
         render.save_film(file, pictures, round(1000 * world.dt))
     say(f"wrote {gif}: forest {seeds[shown]}, {args.pilots[-1]}")
     return 0
+
+
+def cockpit(world: World, weights: Path, seed: int) -> str:
+    """The address where extras/cockpit shows how a network flies through a forest.
+
+    >>> cockpit(World(), Path("runs/mine/best.pt"), 7)
+    'http://127.0.0.1:8642/#world=plain&weights=runs/mine&pilot=network&seed=7'
+    """
+    kind = "beacon" if world.beacon else "plain" if world.camera == "grey" else world.camera
+    name = f"runs/{weights.parent.name}" if weights.name == "best.pt" else weights.stem
+    return f"http://127.0.0.1:8642/#world={kind}&weights={name}&pilot=network&seed={seed}"
 
 
 # -------------------------------------------------- statistics, film: skip on a first reading
@@ -482,7 +507,7 @@ def print_table(figures: dict[str, dict]) -> None:
     """One row a figure, one column a pilot; more than one table where the terminal is narrow."""
     room = max((shutil.get_terminal_size().columns - 12) // 17, 1)
     for some in (list(figures)[i : i + room] for i in range(0, len(figures), room)):
-        say(f"{'':12}" + "".join(f"{name:>17}" for name in some))
+        say(f"{'':12}" + "".join(f"{name[-16:]:>17}" for name in some))
         for key, (label, factor) in ROWS.items():
             cells = [[f"{factor * x:z.0f}" for x in figures[p][key].values()] for p in some]
             texts = [f"{x} [{', '.join(ends)}]" if ends else x for x, *ends in cells]
@@ -751,10 +776,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         sub.add_argument("--" + f.name.replace("_", "-"), help=describe(f), **kind)
     sub = commands.add_parser("eval", help="fly trained weights against three other pilots")
     sub.set_defaults(run=evaluate)
-    names = ("random", "straight", "laser", "dqn")
     sub.add_argument("--weights", type=place, help="default: weights/paper.pt or weights/beacon.pt")
-    more = {"choices": names, "default": names, "metavar": "PILOT"}
-    sub.add_argument("--pilots", nargs="+", **more, help=f"of {', '.join(names)}; default: all")
+    of = f"of {', '.join(PILOTS)}; default: all. Or one file of eval --json: then its forests"
+    sub.add_argument("--pilots", nargs="+", default=PILOTS, metavar="PILOT", help=of)
     more = {"choices": render.CAMERAS, "default": "grey", "metavar": "KIND"}
     sub.add_argument("--camera", **more, help="what its pictures say: grey or disparity")
     more = {"type": int, "metavar": "N"}
@@ -784,7 +808,8 @@ def start_training(args: argparse.Namespace) -> int:
     changed = [FLAGS[name] for name in FLAGS if vars(args).get(name)]
     changed += [PRESETS[args.preset or "default"], given]
     c, rc = configure({key: value for changes in changed for key, value in changes.items()})
-    demos = read_demos(args.demos, rc.beacon) if args.demos else []
+    flights = read_flights(args.demos, rc.beacon, TRAIN_END - 1) if args.demos else []
+    demos = [(flight["seed"], flight["actions"]) for flight in flights]
     numbers = (f"{i:03d}" for i in range(1, 10**6) if not os.path.lexists(f"runs/{i:03d}"))
     folder = Path("runs", args.name or next(numbers))
     made = [path for path in (folder, folder.parent) if not os.path.exists(path)]
@@ -847,13 +872,17 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
     return c, rc
 
 
-def load_pilot(args: argparse.Namespace) -> QNetwork:
-    """Check all that is given before anything flies, and read the weights. Raises ValueError."""
+def load_pilot(args: argparse.Namespace) -> tuple[QNetwork, Flights]:
+    """Check all that is given before anything flies, and read weights and recorded flights. Raises
+    ValueError."""
     for name, low, high in (
         ("episodes", 1, 10**4), ("first_seed", 0, 10**18), ("threads", 1, CORES)
     ):  # fmt: skip
         if not low <= (value := vars(args)[name]) <= high:
             raise ValueError(f"{name} is {value}, allowed are whole numbers from {low} to {high:,}")
+    files = [pilot for pilot in args.pilots if pilot not in PILOTS]
+    if len(files) > 1 or not all(map(os.path.isfile, files)):
+        raise ValueError(f"pilots are {', '.join(PILOTS)}, or one file; {files[-1]!r} is none")
     torch.set_num_threads(args.threads)
     shipped = Path(__file__).resolve().parent / "weights"
     name = "beacon" if args.beacon else "paper" if args.camera == "grey" else args.camera
@@ -865,7 +894,8 @@ def load_pilot(args: argparse.Namespace) -> QNetwork:
         gif, report = (os.path.realpath(x) for x in (args.out / "flight.gif", args.json))
         if f"{gif}/".startswith(f"{report}/") or f"{report}/".startswith(f"{gif}/"):
             raise ValueError(f"json is {args.json}, where the film goes: name another file")
-    return q
+    recorded = read_flights(Path(files[0]), args.beacon) if files else []
+    return q, list({flight["seed"]: flight for flight in recorded}.values())
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -265,6 +265,10 @@ train --resume runs/taken/log.csv
 train --resume EMPTY
 train --resume runs/old/checkpoint.pt
 eval --pilots laser pigeon
+eval --pilots text.pt
+eval --pilots demos/return.json
+eval --pilots demos/good.json demos/good.json
+eval --pilots demos/good.json --beacon
 eval --pilots
 eval --episodes 0
 eval --episodes -5
@@ -433,6 +437,19 @@ def test_the_shipped_pilot_beats_the_papers_180_percent(tmp_path: Path) -> None:
         assert steps[-1][-1]["edge"] == flight["edge"]
         assert steps[-1][-1]["progress"] == flight["progress"]
         assert sum(step[1] for step in steps) == pytest.approx(flight["return"])
+
+
+def test_recorded_flights_are_one_more_column_over_their_own_forests(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    flights = fly(straight_pilot, [8, 3, 8], WORLD, blind=True)
+    report = {"beacon": False, "pilots": {"you": {"flights": flights}}}
+    Path("mine.json").write_text(json.dumps(report))
+    assert deepflight.main(["eval", "--pilots", "straight", "mine.json", "--json", "out.json"]) == 0
+    pilots = json.loads(Path("out.json").read_text())["pilots"]
+    assert pilots["mine.json"] == pilots["straight"]
+    assert [flight["seed"] for flight in pilots["mine.json"]["flights"]] == [8, 3]
 
 
 def test_the_shipped_beacon_pilot_flies_in_its_own_world_only() -> None:

@@ -31,7 +31,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from deepflight import EVAL_FIRST, dqn_pilot
+from deepflight import EVAL_FIRST, cockpit, dqn_pilot
 from dqn import DQNConfig, load_weights
 from env import (
     Flights,
@@ -149,7 +149,8 @@ def main() -> None:
     failed.sort(key=lambda f: (f["outcome"] != "crash", f["progress"]))
     worst = [{"seed": f["seed"], "cause": cause(f, world)} | f for f in failed]
     for f in worst:
-        print(f"{f['seed']}  {f['cause']:8}  {f['steps']:4} steps, progress {f['progress']:.1f} m")
+        print(f"{f['cause']:8} {f['steps']:4} steps, progress {f['progress']:.1f} m:", end=" ")
+        print(cockpit(world, ROOT / "weights/beacon.pt", f["seed"]))
     report = {"forests": FORESTS, "densities": DENSITIES, "speeds": SPEEDS, "crossed": table}
     report |= {"first_seed": EVAL_FIRST, "worst_of": WORST_OF, "worst": worst}
     (ROOT / "results/atlas.json").write_text(json.dumps(report, indent=1) + "\n")

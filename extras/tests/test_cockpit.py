@@ -11,20 +11,22 @@ from base64 import b64decode
 from collections.abc import Iterator
 from http.client import HTTPConnection
 from pathlib import Path
+from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
 import pytest
 import torch
 from numpy.random import Generator
 
-from deepflight import dqn_pilot, read_demos
+import deepflight
+from deepflight import dqn_pilot, read_flights
 from dqn import QNetwork, load_weights, save_weights
 from env import Pilot, World, fly, laser_pilot, refly, straight_pilot
-from extras.cockpit.__main__ import LARGEST, Server
-from extras.cockpit.flights import ROOT, Hangar
+from extras.cockpit.__main__ import HOST, LARGEST, PORT, Server
+from extras.cockpit.flights import ROOT, WORLDS, Hangar
 from render import camera
 
-WORLDS = {"plain": ("paper", World()), "beacon": ("beacon", World(beacon=True))}
+HOMES = {"plain": ("paper", World()), "beacon": ("beacon", World(beacon=True))}
 SEED, FIRST = 1, {"world": "plain", "weights": "paper", "seed": "1"}
 
 
@@ -38,7 +40,7 @@ def server() -> Iterator[Server]:
 
 
 def network(world: str) -> QNetwork:
-    name, w = WORLDS[world]
+    name, w = HOMES[world]
     return load_weights(ROOT / f"weights/{name}.pt", w.actions, beacon=w.beacon, camera=w.camera)
 
 
@@ -63,13 +65,13 @@ def flown(server: Server, actions: str = "", pilot: str = "network", **more: str
     return ask(server, "/fly", actions=actions, pilot=pilot, **counts)
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", HOMES)
 @pytest.mark.parametrize("name", ["network", "laser", "straight"])
 def test_each_pilot_flies_as_in_eval(server: Server, world: str, name: str) -> None:
     pilots: dict[str, Pilot] = {"laser": laser_pilot(0.99), "straight": straight_pilot}
     pilot = pilots.get(name) or dqn_pilot(network(world))
-    (flight,) = fly(pilot, [SEED], WORLDS[world][1])
-    answer = flown(server, pilot=name, world=world, weights=WORLDS[world][0])
+    (flight,) = fly(pilot, [SEED], HOMES[world][1])
+    answer = flown(server, pilot=name, world=world, weights=HOMES[world][0])
     assert answer["record"] == flight
     assert answer["moments"][-1]["return"] == flight["return"]
     assert answer["moments"][-1]["outcome"] == flight["outcome"] != ""
@@ -95,12 +97,12 @@ def test_q_and_pictures_are_those_of_the_network_and_the_camera(server: Server) 
         assert (moment["reward"], moment["pose"]) == (r, [*info["pose"]])
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", HOMES)
 @pytest.mark.parametrize("time", [0, 2, 40])
 def test_removal_is_what_one_gets_by_drawing_every_picture_again(
     server: Server, world: str, time: int
 ) -> None:
-    name, w = WORLDS[world]
+    name, w = HOMES[world]
     more = FIRST | {"world": world, "weights": name}
     actions = flown(server, **more)["record"]["actions"]
     answer = ask(server, "/why", actions=actions, time=str(time), **more)
@@ -149,7 +151,18 @@ def test_flights_train(server: Server, tmp_path: Path) -> None:
     flights = [flown(server, pilot=pilot)["record"] for pilot in ("straight", "network")]
     file = tmp_path / "flights.json"
     file.write_text(json.dumps({"beacon": False, "pilots": {"you": {"flights": flights}}}))
-    assert read_demos(file, False) == [(SEED, flight["actions"]) for flight in flights]
+    assert read_flights(file, False) == flights
+
+
+def test_the_address_that_eval_prints_is_one_of_the_page() -> None:
+    hangar = Hangar()
+    for kind, world in WORLDS.items():
+        address = urlsplit(
+            deepflight.cockpit(world, ROOT / f"weights/{kind.replace('plain', 'paper')}.pt", 5)
+        )
+        asked = dict(parse_qsl(address.fragment))
+        assert (address.hostname, address.port) == (HOST, PORT)
+        hangar.fly(asked | {"actions": "", "more": "1", "since": "0"})
 
 
 def test_weights_are_those_of_two_folders_and_each_has_its_world(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from selenium.webdriver import ActionChains, Chrome, Keys
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
-from deepflight import dqn_pilot, read_demos
+from deepflight import dqn_pilot, read_flights
 from dqn import load_weights
 from env import ForestEnv, World, fly, refly
 from extras.cockpit.flights import ROOT
@@ -241,8 +241,8 @@ def test_saved_flights_train(browser: Chrome, host: str) -> None:
     click(browser, "save")
     file = browser.downloads / "flights.json"
     WebDriverWait(browser, 30).until(lambda _: file.exists())
-    demos = read_demos(file, False)
-    assert demos[-1] == (record["seed"], record["actions"])
+    flown = read_flights(file, False)[-1]
+    assert (flown["seed"], flown["actions"]) == (record["seed"], record["actions"])
     report = json.loads(file.read_text())
     assert report["program"] == "Deep Flight"
     assert math.isclose(report["pilots"]["you"]["flights"][-1]["return"], record["return"])
