@@ -131,10 +131,9 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 
     The field calls this reward shaping. A policy is a rule that picks the action in every state.
     One kind of it leaves the best policy as it is: what it pays for a step forward, it takes for
-    the step back (potential-based shaping [Ng 1999]). The pay for metres would be of that kind if
-    it were gamma * x2 - x, and it is x2 - x. The prizes are not, and are meant to change the
-    policy. All this is for the network alone. Every
-    reward that is printed or logged is the paper's.
+    the step back (potential-based shaping [Ng 1999]). The pay for metres is of that kind, but for a
+    factor of gamma. The prizes are not, and are meant to change the policy. All this is for the
+    network alone. Every reward that is printed or logged is the paper's.
     """
     forward = np.array([info["forward"] for info in infos])  # (L,) m
     arrived = np.array([info["outcome"] == "goal" for info in infos])  # (L,)
@@ -175,7 +174,8 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 #                       labels of ten are 0, and one is -10, a crash: Q should be their mean, -1. An
 #                       error pulls Q by the slope of the loss. If that is at most 1, Q comes to
 #                       rest where 9 * (0 - Q) = 1, at -0.11: the crash is nearly ignored. If it may
-#                       be 10, Q becomes -1. (PyTorch divides this loss, and so every pull, by 10)
+#                       be 10, Q becomes -1. (PyTorch divides this loss by 10. That makes all pulls
+#                       smaller alike, so they balance at the same Q)
 #     [+average]        in the last tenth of the steps the mean of Q's weights is taken, to be
 #                       flown: every update changes how Q flies, and a mean is steady
 #     [+teacher] [+demos]    off by default; they have a section of their own, after `train`
@@ -211,16 +211,17 @@ def train(c: DQNConfig, rc: RunConfig, folder: Path, saved: Any = None, demos: A
         fleet.reset(fleet.landed, rng.integers(TRAIN_END, size=len(fleet.landed)))  # 4, 5
         s, scores = fleet.observations, teach(fleet, c, rc)  # (L, 4, 84, 84), (L, A) [+teacher]
         explore = rng.random(c.num_envs) < epsilon  # 7 (L,)
-        anything = rng.integers(world.actions, size=c.num_envs)  # (L,)
-        anything = scores.argmax(1) if c.teacher else anything  # (L,) [+teacher]
-        a = np.where(explore, anything, greedy(agent.q, s))  # 8 (L,)
+        trial = rng.integers(world.actions, size=c.num_envs)  # (L,)
+        trial = scores.argmax(1) if c.teacher else trial  # (L,) [+teacher]
+        a = np.where(explore, trial, greedy(agent.q, s))  # 8 (L,)
         s2, r, terminated, truncated, infos = fleet.step(a)  # 9, 10
         r = learner_reward(r, infos, rc, c.gamma)  # (L,)
         replay.add(s, a, r, s2, terminated, truncated, scores)  # 11
         first = lesson is not None and agent.updates == 0  # [+demos]
         if first:
             rehearse(agent, lesson, c, rng)
-        for _ in range(run.due(c.update_every) if step >= c.learning_starts else 0):
+        updates = run.due(c.update_every) if step >= c.learning_starts else 0
+        for _ in range(updates):
             learn(agent, draw(replay, lesson, c, rng), c)  # 12 to 15
             if run.last_share:  # [+average]
                 agent.mean.update_parameters(agent.q)
@@ -272,8 +273,8 @@ def learn(agent: Agent, b: dqn.Batch, c: DQNConfig) -> None:
 BEACON = {"steps": 400_000, "forward_reward": 0.0, "far_value": 50.0}
 # A teacher acts where Q would explore, until Q acts alone. It knows where the far edge is, so less
 # pay for metres and for that edge is enough. 115 was found by trial: with 125 the pilot leaves
-# sooner, and earns less; with 80, and half the pay for metres, it stays longer, earns more, and
-# crosses less often.
+# sooner, and earns less; with 80, and 0.5 a metre, it stays longer, earns more, and crosses less
+# often.
 TEACHER = dict(
     bellman=False, learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000,
     lr_decay=0.0, test_every=20_000, forward_reward=1.0, far_value=115.0,

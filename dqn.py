@@ -78,6 +78,16 @@ code carries these numbers. `train` in deepflight.py and what it calls have all 
 In our words: an episode is a flight, the emulator is env.py, x is a picture, phi_t is the stack of
 four pictures that we call s, and theta are the weights.
 
+What is in the network? **Layers**, one after another. Each number that comes out of a layer is a
+weighted sum of numbers that go in, plus a constant, its bias. With inputs 2 and -1, weights 3 and
+4, and bias 1, that is 3 * 2 + 4 * -1 + 1 = 3. In a linear layer every output has a weight for each
+input: 3,136 inputs and 512 outputs make 1.6 of our 1.7 million weights. Two such layers would be no
+better than one, because a sum of sums is a sum. So between layers stands ReLU, which turns negative
+numbers into 0. A convolution is a layer for pictures. Its outputs see only a small square each, and
+all of them use the same few weights, called a filter. Let a filter of two pixels have the weights
+-1 and 1, and let it slide along the row 5 5 9 9. Out come 0 4 0: it has found the edge. A filter of
+8x8 pixels that moves on by 4 pixels at a time has (84 - 8) / 4 + 1 = 20 places in a row of 84.
+
 PyTorch in short. The loss is one number that says how wrong a batch of outputs is, such as half
 the mean of (y - Q)^2. Its gradient says for every weight which way the loss grows, and how fast.
     q(s)               calls QNetwork.forward; a tensor is an array that remembers how it was made,
@@ -86,12 +96,13 @@ the mean of (y - Q)^2. Its gradient says for every weight which way the loss gro
     optimizer.zero_grad()   forget the last gradient
     loss.backward()    compute the gradient, and leave it with the weights
     optimizer.step()   move the weights a little against the gradient
-    smooth_l1_loss(q, y, beta=10)   with e = q - y, the mean of e^2 / 20 up to an error of 10, and
-                       of abs(e) - 5 beyond: a square that goes on as a straight line
+    smooth_l1_loss(q, y, beta=10)   the mean over the batch. With e = q - y, it is e^2 / 20 up to an
+                       error of 10, and abs(e) - 5 beyond: a square that goes on as a straight line
     values.gather(1, a[:, None])[:, 0]      in NumPy: values[arange(len(a)), a]
     nn.Module          a function that owns weights; state_dict() gives them all, by name
     nn.Sequential(f, g)     g(f(x))
-    nn.Conv2d(4, 32, 8, 4)  filters: 4 pictures in, 32 out, 8x8 pixels, strides of 4
+    nn.Conv2d(4, 32, 8, 4)  a convolution: 4 pictures in, 32 out, 8x8 pixels, strides of 4
+    nn.Linear(3136, 512)    a linear layer; nn.Flatten puts pictures into one row for it
     x.sqrt_()          a name with _ at its end changes x itself
 
 A mark like [+double] means: not in the textbook. `double` is then a setting, and its text says how
@@ -197,9 +208,9 @@ class QNetwork(nn.Module):
 
     pictures (4, 84, 84) -> conv 32 8x8/4 -> conv 64 4x4/2 -> conv 64 3x3/1 -> 512 -> Q(s, .) (A,)
 
-    conv 32 8x8/4: 32 small filters of 8x8 pixels, through all four pictures, slide over them in
-    strides of 4 pixels. Each answers strongly where it finds its pattern. ReLU makes negative
-    numbers 0. The last layer has none, because values may be negative.
+    conv 32 8x8/4: 32 filters of 8x8 pixels, through all four pictures, slide over them in strides
+    of 4. Each gives a large number where it finds its pattern. The last layer has no ReLU, because
+    values may be negative.
     """
 
     def __init__(self, actions: int) -> None:
@@ -237,7 +248,7 @@ def td_target(r: Tensor, gamma_n: Tensor, end: Tensor, q2: Tensor, q2_online: Te
 
     r, gamma_n, end (B,). Only TERMINAL stops the sum: a time limit ends the flight, but not the
     world. q2 (B, A): Q^(s2, .), which says what an action is worth. q2_online (B, A): the values by
-    which a2 is chosen. In the textbook these are q2 too.
+    which a2 is chosen: those of Q, which learns on line. In the textbook these are q2 too.
 
     [+double] Let two actions both be worth 0 in truth, and let Q^ err by +1 and -1. A max picks
     whatever error points upwards: it is 1, too high. Let Q choose a2 instead. If its errors had
@@ -450,10 +461,9 @@ class RMSprop(torch.optim.Optimizer):
 
     The variance is the running mean of g^2, less the square of the running mean of g. Mnih's table
     has a "gradient momentum" of 0.95 and a "squared gradient momentum" of 0.95. Both are decay
-    factors of these means. PyTorch's own RMSprop with momentum 0.95 is
-    another algorithm: there, each move goes on with 0.95 of the last one. Mnih's epsilon is 0.01
-    for a gradient that is the sum over a batch of 32. Ours is the mean, so our epsilon is 0.01 /
-    32^2.
+    factors of these means. PyTorch's own RMSprop with momentum 0.95 is another algorithm: there,
+    each move goes on with 0.95 of the last one. Mnih's epsilon (not that of exploring) is 0.01 for
+    a gradient that is the sum over a batch of 32. Ours is the mean, so our epsilon is 0.01 / 32^2.
     """
 
     def __init__(self, theta: Any, lr: float) -> None:

@@ -45,7 +45,7 @@ is a deterministic function of its seed and its actions. Keep those two and you 
 picture by picture.
 
 Legend
-    d_obs     m, from the drone's centre to the nearest bark, at most the laser's 20 m
+    d_obs     m, from the drone's centre to the nearest bark, at most 20 m, the range of a laser
     d_goal    m, from the drone's centre to the goal
     d_max     m, the forest's length
     psi       rad, the heading
@@ -390,6 +390,59 @@ def laser_pilot(gamma: float) -> Pilot:
     return act
 
 
+def fly(pilot: Pilot, seeds: Sequence[int], world: World, *, blind: bool = False) -> Flights:
+    """Fly one forest per seed, a hundred at once; returns the flights in the order of the seeds."""
+    flights: Flights = []
+    fleet = Fleet(world, min(len(seeds), 100), blind=blind)
+    for group in (seeds[i : i + 100] for i in range(0, len(seeds), 100)):
+        fleet.reset(range(len(group)), group)
+        while flying := fleet.flying:
+            show(f"{len(flights) + len(group) - len(flying):,} of {len(seeds):,} flights landed")
+            fleet.step(pilot(fleet))
+        flights += [env.flight() for env in fleet.envs[: len(group)]]
+    show("")
+    return flights
+
+
+def fly_random(seeds: Sequence[int], world: World, rng: np.random.Generator) -> Flights:
+    """The bar that others are compared with: 2,000 random flights or more, equally many through
+    each forest. The mean of only a hundred could be off by a fifth."""
+    repeats = math.ceil(2000 / len(seeds))
+    return fly(random_pilot(rng), list(seeds) * repeats, world, blind=True)
+
+
+def measure(flights: Flights) -> dict[str, ndarray]:
+    """One number a flight (F,): steps, progress in m, return, and 0 or 1 for how it ended.
+
+    Crossed means arrived at the goal or left by the far edge.
+    """
+    table = {key: np.array([f[key] for f in flights]) for key in ("steps", "progress", "return")}
+    table["crossed"] = np.array([f["outcome"] == "goal" or f["edge"] == "far" for f in flights])
+    return table | {o: np.array([f["outcome"] == o for f in flights]) for o in OUTCOMES}
+
+
+def say(text: str, end: str = "\n", file: TextIO | None = None) -> None:
+    """Print, and work on if nobody reads: what goes to a closed pipe or terminal is lost."""
+    file = file or sys.stdout
+    try:
+        print(text, end=end, file=file, flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
+        if file is not sys.stderr and error.errno not in (errno.EPIPE, errno.EIO):
+            error.filename = file.name
+            raise
+
+
+def show(text: str) -> None:
+    """Show a passing status on a terminal, over the last one; nothing when piped."""
+    if getattr(sys.stdout, "isatty", bool)() and os.environ.get("TERM") != "dumb":
+        room = min(shutil.get_terminal_size().columns, 999) - 1
+        say(f"{text[:room]:{room}}", "\r")
+
+
+# -------------------------------------------------- a planner: read it after dqn.py
+
+
 def teach(fleet: Fleet, gamma: float, *paid: float) -> ndarray:
     """What `plan` says to each of F drones: (F, A)."""
     return np.array([plan(*e.scan(), e.pose, e.world, gamma, *paid) for e in fleet.flying])
@@ -458,56 +511,6 @@ def ways(world: World) -> tuple[ndarray, ndarray]:
     pairs = np.stack(np.meshgrid(rates, rates, indexing="ij"), -1).reshape(-1, 2)  # (W, 2)
     headings = np.cumsum(np.repeat(pairs, steps, 1), 1) * world.dt  # (W, T) rad
     return np.cumsum(world.speed * world.dt * np.exp(1j * headings), 1), headings
-
-
-def fly(pilot: Pilot, seeds: Sequence[int], world: World, *, blind: bool = False) -> Flights:
-    """Fly one forest per seed, a hundred at once; returns the flights in the order of the seeds."""
-    flights: Flights = []
-    fleet = Fleet(world, min(len(seeds), 100), blind=blind)
-    for group in (seeds[i : i + 100] for i in range(0, len(seeds), 100)):
-        fleet.reset(range(len(group)), group)
-        while flying := fleet.flying:
-            show(f"{len(flights) + len(group) - len(flying):,} of {len(seeds):,} flights landed")
-            fleet.step(pilot(fleet))
-        flights += [env.flight() for env in fleet.envs[: len(group)]]
-    show("")
-    return flights
-
-
-def fly_random(seeds: Sequence[int], world: World, rng: np.random.Generator) -> Flights:
-    """The bar that others are compared with: 2,000 random flights or more, equally many through
-    each forest. The mean of only a hundred could be off by a fifth."""
-    repeats = math.ceil(2000 / len(seeds))
-    return fly(random_pilot(rng), list(seeds) * repeats, world, blind=True)
-
-
-def measure(flights: Flights) -> dict[str, ndarray]:
-    """One number a flight (F,): steps, progress in m, return, and 0 or 1 for how it ended.
-
-    Crossed means arrived at the goal or left by the far edge.
-    """
-    table = {key: np.array([f[key] for f in flights]) for key in ("steps", "progress", "return")}
-    table["crossed"] = np.array([f["outcome"] == "goal" or f["edge"] == "far" for f in flights])
-    return table | {o: np.array([f["outcome"] == o for f in flights]) for o in OUTCOMES}
-
-
-def say(text: str, end: str = "\n", file: TextIO | None = None) -> None:
-    """Print, and work on if nobody reads: what goes to a closed pipe or terminal is lost."""
-    file = file or sys.stdout
-    try:
-        print(text, end=end, file=file, flush=True)
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
-        if file is not sys.stderr and error.errno not in (errno.EPIPE, errno.EIO):
-            error.filename = file.name
-            raise
-
-
-def show(text: str) -> None:
-    """Show a passing status on a terminal, over the last one; nothing when piped."""
-    if getattr(sys.stdout, "isatty", bool)() and os.environ.get("TERM") != "dumb":
-        room = min(shutil.get_terminal_size().columns, 999) - 1
-        say(f"{text[:room]:{room}}", "\r")
 
 
 # -------------------------------------------------- legal worlds: skip this on a first reading

@@ -26,6 +26,7 @@ ground plane. A camera is 84 rays. A laser scanner is 360 rays. One formula serv
       half_chord = sqrt(radius^2 - across^2)      by Pythagoras, if abs(across) < radius
       distance   = along - half_chord             from the eye to the bark
       facing     = half_chord / radius            the cosine of the angle at #: 1 head-on, 0 grazing
+                                                  (bark is drawn darker where it is small)
 
     One ray in numbers: a trunk of radius 0.5 m stands 10 m ahead and 0.3 m to the right. A ray
     that points straight ahead has along = 10 and across = -0.3, so half_chord = 0.4, and the
@@ -36,14 +37,15 @@ The two rules of a pinhole camera:
   * Column i looks along tan(bearing) = (41.5 - i) / 42, positive to the left. Columns are equally
     spaced on the picture plane, and not in angle.
   * A point h metres above the eye at depth z shows at row 41.5 - 42 * h / z. Depth is measured
-    along the optical axis. With the distance along the ray instead, straight walls would look bent.
+    straight ahead, along the optical axis. With the distance along the ray instead, straight walls
+    would look bent.
 
 A picture, in words: for each column, cast its ray. If it hits bark, work out the depth, and from it
 the rows of the trunk's top and foot. Fill the rows between with dark grey, which fades into the
 sky's grey with distance. All other rows are sky above the horizon, and ground below.
 
 That is the grey camera. The disparity camera has the same outlines. It says of each point how near
-it is, 510 / depth in metres, as a stereo camera measures it, and 0 of the sky. Paint and light do
+it is, 255 * 2 / depth: 255 at 2 m and nearer, half of that at 4 m, 0 in the sky. Paint and light do
 not change that. So a pilot that has learnt by it in one forest should fly in others [DF §IV].
 
 Legend
