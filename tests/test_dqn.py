@@ -308,13 +308,13 @@ def test_what_the_teacher_said_comes_back_with_its_state() -> None:
     assert not batch.shown.any()
 
 
-def test_a_quarter_of_each_batch_is_demonstrated_and_at_first_all_of_it() -> None:
+def test_a_share_of_each_batch_is_demonstrated_and_at_first_all_of_it() -> None:
     own, lesson = Replay(40, 1), Replay(40, 1, shown=True)
     for replay, value in ((own, 1.0), (lesson, 2.0)):
         for _ in range(30):
             state, none = np.zeros((1, 4, 84, 84), np.uint8), np.zeros(1, bool)
             replay.add(state, np.zeros(1), np.full(1, value), state, none, none)
-    c, rng = DQNConfig(n_steps=1), np.random.default_rng(0)
+    c, rng = DQNConfig(n_steps=1, demo_share=0.25), np.random.default_rng(0)
     for batch, shown in (
         (draw(own, None, c, rng), 0),
         (draw(own, lesson, c, rng), 8),
