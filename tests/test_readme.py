@@ -142,6 +142,24 @@ def test_the_atlas_says_what_the_pages_say() -> None:
     assert f"--first-seed {atlas['worst'][0]['seed']}" in RESULTS
 
 
+def test_each_row_of_the_transfer_table_is_what_the_looks_did() -> None:
+    table = report("transfer")
+
+    def cell(pilot: str, look: str) -> str:
+        if look not in table[pilot]:
+            return ""
+        x, change = table[pilot][look], table[pilot][look]["change"]["crossed"]
+        crossed, crash, longer = (
+            100 * x[key]["value"] for key in ("crossed", "crash", "over_random")
+        )
+        ends = f" [{100 * change['low']:+.1f}, {100 * change['high']:+.1f}]" * (look != "plain")
+        return f"{crossed:.1f}{ends} / {crash:.1f} / {longer:.0f}"
+
+    for look in {look: 0 for looks in table.values() for look in looks}:
+        row = " | ".join([look, *(cell(pilot, look) for pilot in table)])
+        assert f"| {row} |" in RESULTS
+
+
 def test_the_clock_on_the_pages_is_the_measured_one() -> None:
     rewards, taught = (report("clock")[name] for name in ("from rewards", "taught"))
     steps, later = (max(s["step"] for s in x["seeds"].values()) for x in (rewards, taught))
@@ -156,6 +174,7 @@ def test_the_minutes_of_a_training_are_those_of_its_log() -> None:
     for name, said in (
         ("paper", "With `--threads 1` it made the shipped pilot in {} minutes."),
         ("beacon", "It took {} minutes for 400,000 steps"),
+        ("disparity", "made `weights/disparity.pt` in {} minutes"),
     ):
         *_, seconds = (ROOT / f"results/{name}/log.csv").read_text().splitlines()[-1].split(",")
         assert said.format(round(float(seconds) / 60)) in FLAT + LONG

@@ -1,7 +1,7 @@
 """Which pilot flies on when the world looks different? Grey against disparity [DF §IV].
 
     .venv/bin/python -m extras.experiments.looks train   # half an hour, two trainings at a time
-    .venv/bin/python -m extras.experiments.looks fly     # a quarter of an hour
+    .venv/bin/python -m extras.experiments.looks fly     # ten minutes
     .venv/bin/python -m extras.experiments.looks draw
     .venv/bin/python -m extras.experiments.looks time    # leave the machine alone: half a minute
 
@@ -89,7 +89,7 @@ STEREO = {
     "holes, filled": Look(holes=0.5, filled=True),
     "whole steps": Look(quantum=STEREO_PIXEL),
     "shifted edges": Look(fat=1),
-    "all of a stereo pair": Look(error=4.0, holes=0.5, filled=True, quantum=STEREO_PIXEL, fat=1),
+    "all together": Look(error=4.0, holes=0.5, filled=True, quantum=STEREO_PIXEL, fat=1),
 }
 PILOTS = {  # name -> camera, weights
     "grey": ("grey", ROOT / "weights/paper.pt"),
