@@ -883,7 +883,9 @@ def load_pilot(args: argparse.Namespace) -> tuple[QNetwork, Flights]:
             raise ValueError(f"{name} is {value}, allowed are whole numbers from {low} to {high:,}")
     files = [pilot for pilot in args.pilots if pilot not in PILOTS]
     if len(files) > 1 or not all(map(os.path.isfile, files)):
-        raise ValueError(f"pilots are {', '.join(PILOTS)}, or one file; {files[-1]!r} is none")
+        raise ValueError(
+            f"pilots are {', '.join(PILOTS)}, or one file; {files[-1]!r} is none of these"
+        )
     torch.set_num_threads(args.threads)
     shipped = Path(__file__).resolve().parent / "weights"
     name = "beacon" if args.beacon else "paper" if args.camera == "grey" else args.camera
