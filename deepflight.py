@@ -131,9 +131,10 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
 
     The field calls this reward shaping. A policy is a rule that picks the action in every state.
     One kind of it leaves the best policy as it is: what it pays for a step forward, it takes for
-    the step back (potential-based shaping [Ng 1999]). The pay for metres is of that kind, but for a
-    factor of gamma. The prizes are not, and are meant to change the policy. All this is for the
-    network alone. Every reward that is printed or logged is the paper's.
+    the step back (potential-based shaping [Ng 1999]). It pays gamma * P(s2) - P(s), where P is any
+    function of the state. The pay for metres is that with P = 2 * x, but for gamma. The prizes are
+    not, and are meant to change the policy. All this is for the network alone. Every reward that is
+    printed or logged is the paper's.
     """
     forward = np.array([info["forward"] for info in infos])  # (L,) m
     arrived = np.array([info["outcome"] == "goal" for info in infos])  # (L,)
@@ -236,8 +237,8 @@ def draw(replay: Replay, lesson: Replay | None, c: DQNConfig, rng: Generator) ->
     shown = round(c.demo_share * c.batch_size) if lesson else 0
     parts = [(replay, c.batch_size - shown), (lesson, shown)]
     drawn = [part.sample(n, c.n_steps, c.gamma, rng) for part, n in parts if n]  # [+n_steps]
-    fields = zip(*drawn, strict=True)  # s of all parts, then a of all parts, ...
-    batch = dqn.Batch(*(np.concatenate(field) for field in fields))  # all with B rows
+    columns = zip(*drawn, strict=True)  # s of all parts, then a of all parts, ...
+    batch = dqn.Batch(*(np.concatenate(column) for column in columns))  # all with B rows
     batch = mirror(batch, env.World.actions, rng) if c.mirror else batch  # [+mirror]
     return dqn.Batch(*map(torch.from_numpy, batch))
 
@@ -263,41 +264,6 @@ def learn(agent: Agent, b: dqn.Batch, c: DQNConfig) -> None:
     agent.updates += 1
     if agent.updates % c.target_every == 0:
         agent.q_target.load_state_dict(agent.q.state_dict())  # 15
-
-
-# -------------------------------------------------- other settings
-
-# With the beacon the goal can be seen. So no other way out should be worth as much. Metres are not
-# paid either: a pilot that is paid for them flies past the goal. Finding the goal takes longer to
-# learn.
-BEACON = {"steps": 400_000, "forward_reward": 0.0, "far_value": 50.0}
-# A teacher acts where Q would explore, until Q acts alone. It knows where the far edge is, so less
-# pay for metres and for that edge is enough. 115 was found by trial: with 125 the pilot leaves
-# sooner, and earns less; with 80, and 0.5 a metre, it stays longer, earns more, and crosses less
-# often.
-TEACHER = dict(
-    bellman=False, learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000,
-    lr_decay=0.0, test_every=20_000, forward_reward=1.0, far_value=115.0,
-)  # fmt: skip
-# Whoever has seen demonstrations need not begin by chance.
-DEMOS = {"epsilon_decay": 1}
-# Textbook DQN on the paper's reward, with Adam. What is only quicker stays: eight drones fly side
-# by side, in bfloat16.
-DQN = dict(
-    double=False, n_steps=1, mirror=False, huber=1.0, lr_decay=1.0, average=0.0,
-    forward_reward=0.0, goal_value=0.0, far_value=0.0,
-)  # fmt: skip
-# [Mnih15, Extended Data Table 1], as the paper says [DF §II-B], but eight drones fly, and rewards
-# are not cut. 1.4 M steps are the paper's own.
-# Mnih's table says: copy Q to the target network every 10,000 updates. Mnih's code does it every
-# 10,000 steps, which are 2,500 updates. We follow the code.
-MNIH = DQN | dict(
-    steps=1_400_000, replay_size=1_000_000, learning_starts=50_000, target_every=2_500,
-    epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, bfloat16=False,
-)  # fmt: skip
-PRESETS = {"default": {}, "dqn": DQN, "mnih": MNIH}
-# What these flags change, unless told otherwise; a later one outdoes an earlier one.
-FLAGS = {"demos": DEMOS, "teacher": TEACHER, "beacon": BEACON}
 
 
 # -------------------------------------------------- a teacher, demonstrations [DF §IV]
@@ -366,38 +332,40 @@ def remember(replay: Replay, fleet: Fleet, a: list[int], c: DQNConfig, rc: RunCo
     replay.add(s, a, r, s2, terminated, truncated, scores)
 
 
-def read_flights(path: Path, beacon: bool, last_seed: float = math.inf) -> Flights:
-    """The flights of a file that `eval --json` or the cockpit wrote. Raises ValueError unless they
-    fly again as it says, in this world, through forests up to `last_seed`."""
-    if not os.path.isfile(path) or not 0 < os.path.getsize(path) <= dqn.LARGEST:
-        raise ValueError(f"{path} is no file of flights, such as eval --json writes")
-    try:
-        report = json.loads(path.read_bytes())
-        written = [flight for pilot in report["pilots"].values() for flight in pilot["flights"]]
-        if report["beacon"] is not beacon:
-            raise ValueError(f"they are not of a world with beacon {beacon}")
-        dqn.check_like([(f["seed"], f["actions"]) for f in written], [(0, "")], "flights")
-        if not written:
-            raise ValueError("it holds no flights")
-        return [fly_again(i, flight, last_seed) for i, flight in enumerate(written, 1)]
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        other = getattr(error, "strerror", None) or "eval --json did not write it"
-        why = error if isinstance(error, ValueError) else other
-        raise ValueError(f"{path} cannot be flown again: {why}") from None
+# -------------------------------------------------- other settings
 
-
-def fly_again(number: int, written: dict[str, Any], last_seed: float) -> dict[str, Any]:
-    """A flight of a file, flown again. Raises ValueError unless it ends as it is written."""
-    show(f"flying recorded flight {number:,}")
-    drone = env.ForestEnv(World(), blind=True)
-    drone.reset(seed=env.whole_number("seed", written["seed"], last_seed))
-    for action in written["actions"]:
-        drone.step(int(action))
-    flown = drone.flight()
-    same = flown["outcome"] and all(flown[key] == written[key] for key in ("outcome", "edge"))
-    if not (same and math.isclose(flown["return"], written["return"])):
-        raise ValueError(f"flight {number} does not fly again as it is written")
-    return flown
+# With the beacon the goal can be seen. So no other way out should be worth as much. Metres are not
+# paid either: a pilot that is paid for them flies past the goal. Finding the goal takes longer to
+# learn.
+BEACON = {"steps": 400_000, "forward_reward": 0.0, "far_value": 50.0}
+# A teacher acts where Q would explore, until Q acts alone. It knows where the far edge is, so less
+# pay for metres and for that edge is enough. 115 was found by trial: with 125 the pilot leaves
+# sooner, and earns less; with 80, and 0.5 a metre, it stays longer, earns more, and crosses less
+# often.
+TEACHER = dict(
+    bellman=False, learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000,
+    test_every=20_000, forward_reward=1.0, far_value=115.0,
+    lr_decay=0.0,  # the learning rate falls to 0
+)  # fmt: skip
+# Whoever has seen demonstrations need not begin by chance.
+DEMOS = {"epsilon_decay": 1}
+# Textbook DQN on the paper's reward, with Adam. What is only quicker stays: eight drones fly side
+# by side, in bfloat16.
+DQN = dict(
+    double=False, n_steps=1, mirror=False, huber=1.0, lr_decay=1.0, average=0.0,
+    forward_reward=0.0, goal_value=0.0, far_value=0.0,
+)  # fmt: skip
+# [Mnih15, Extended Data Table 1], as the paper says [DF §II-B], but eight drones fly, and rewards
+# are not cut. 1.4 M steps are the paper's own.
+# Mnih's table says: copy Q to the target network every 10,000 updates. Mnih's code does it every
+# 10,000 steps, which are 2,500 updates. We follow the code.
+MNIH = DQN | dict(
+    steps=1_400_000, replay_size=1_000_000, learning_starts=50_000, target_every=2_500,
+    epsilon_final=0.1, epsilon_decay=1_000_000, adam=False, bfloat16=False,
+)  # fmt: skip
+PRESETS = {"default": {}, "dqn": DQN, "mnih": MNIH}
+# What these flags change, unless told otherwise; a later one outdoes an earlier one.
+FLAGS = {"demos": DEMOS, "teacher": TEACHER, "beacon": BEACON}
 
 
 # -------------------------------------------------- eval
@@ -871,6 +839,40 @@ def configure(given: dict[str, Any]) -> tuple[DQNConfig, RunConfig]:
     if not c.bellman and not c.teacher:
         raise ValueError("bellman is False, allowed is True, because there is no teacher")
     return c, rc
+
+
+def read_flights(path: Path, beacon: bool, last_seed: float = math.inf) -> Flights:
+    """The flights of a file that `eval --json` or the cockpit wrote. Raises ValueError unless they
+    fly again as it says, in this world, through forests up to `last_seed`."""
+    if not os.path.isfile(path) or not 0 < os.path.getsize(path) <= dqn.LARGEST:
+        raise ValueError(f"{path} is no file of flights, such as eval --json writes")
+    try:
+        report = json.loads(path.read_bytes())
+        written = [flight for pilot in report["pilots"].values() for flight in pilot["flights"]]
+        if report["beacon"] is not beacon:
+            raise ValueError(f"they are not of a world with beacon {beacon}")
+        dqn.check_like([(f["seed"], f["actions"]) for f in written], [(0, "")], "flights")
+        if not written:
+            raise ValueError("it holds no flights")
+        return [fly_again(i, flight, last_seed) for i, flight in enumerate(written, 1)]
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        other = getattr(error, "strerror", None) or "eval --json did not write it"
+        why = error if isinstance(error, ValueError) else other
+        raise ValueError(f"{path} cannot be flown again: {why}") from None
+
+
+def fly_again(number: int, written: dict[str, Any], last_seed: float) -> dict[str, Any]:
+    """A flight of a file, flown again. Raises ValueError unless it ends as it is written."""
+    show(f"flying recorded flight {number:,}")
+    drone = env.ForestEnv(World(), blind=True)
+    drone.reset(seed=env.whole_number("seed", written["seed"], last_seed))
+    for action in written["actions"]:
+        drone.step(int(action))
+    flown = drone.flight()
+    same = flown["outcome"] and all(flown[key] == written[key] for key in ("outcome", "edge"))
+    if not (same and math.isclose(flown["return"], written["return"])):
+        raise ValueError(f"flight {number} does not fly again as it is written")
+    return flown
 
 
 def load_pilot(args: argparse.Namespace) -> tuple[QNetwork, Flights]:

@@ -483,9 +483,10 @@ class RMSprop(torch.optim.Optimizer):
 
 
 def make_optimizer(theta: Iterable[Tensor], c: DQNConfig) -> torch.optim.Optimizer:
-    """[+adam] Adam divides by the root of the mean square of g, not of its variance, and follows a
-    running mean of g. It needs little tuning. Without it: the RMSprop of [Mnih15]. theta: the
-    weights."""
+    """[+adam] Adam keeps two running means for each weight: m of its gradient g, and v of g^2. A
+    running mean goes a small part of the way to each number that comes: m = 0.9 * m + 0.1 * g.
+    The weight moves by -lr * m / sqrt(v). So all weights move at a like pace, whether their
+    gradients are large or small. Without it: the RMSprop of [Mnih15]. theta: the weights."""
     theta = list(theta)
     if not c.adam:
         return RMSprop(theta, c.lr)

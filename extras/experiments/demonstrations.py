@@ -39,7 +39,7 @@ KINDS = {  # label -> flags
     "from scratch": [],
     "demonstrations before": ["--demos", str(DEMO_FILE)],
     "before and during": ["--demos", str(DEMO_FILE), "--demo-share", "0.25"],
-    "teacher in the loop": ["--teacher", "--bellman"],
+    "teacher and TD targets": ["--teacher", "--bellman"],
     "imitation alone": ["--teacher"],
     "before and during, exploring": [
         *("--demos", str(DEMO_FILE), "--demo-share", "0.25", "--epsilon-decay", "40000")
