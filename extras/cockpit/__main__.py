@@ -37,9 +37,10 @@ class Server(ThreadingHTTPServer):
 
     def __init__(self, port: int, hangar: Any) -> None:
         super().__init__((HOST, port), Handler)
-        self.lock = threading.Lock()
+        # Browsers leave port 80 out.
+        self.lock, at = threading.Lock(), f":{self.server_port}".removesuffix(":80")
         self.answers = {"/options": hangar.options, "/fly": hangar.fly, "/why": hangar.why}
-        self.ours = [f"http://{name}:{self.server_port}" for name in (HOST, "localhost")]
+        self.ours = [f"http://{name}{at}" for name in (HOST, "localhost")]
 
     def handle_error(self, *args: Any) -> None:
         """A connection that breaks concerns nobody else."""

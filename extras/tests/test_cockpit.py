@@ -201,6 +201,15 @@ def test_other_sites_are_refused(server: Server, header: str, path: str) -> None
     assert request(server, "/options", "{}", **origin)[0] == 200
 
 
+def test_a_browser_leaves_port_80_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not every machine lets one listen there, so the server only believes that it does."""
+    monkeypatch.setattr(Server, "server_bind", lambda self: setattr(self, "server_port", 80))
+    monkeypatch.setattr(Server, "server_activate", lambda self: None)
+    server = Server(80, Hangar())
+    server.server_close()
+    assert server.ours == ["http://127.0.0.1", "http://localhost"]
+
+
 def test_only_this_machine_can_connect(server: Server) -> None:
     assert server.server_address[0] == "127.0.0.1"
 
