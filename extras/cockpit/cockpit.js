@@ -4,28 +4,33 @@
 
 const $ = (id) => document.getElementById(id);
 const PIXELS = 84;
+const MEANING = { beacon: "A pole stands at the goal, and can be seen.", disparity: "The pictures show how near things are." };
 let options; // what one may choose from, and the numbers of each world
 let chosen = {}; // world, weights, seed, pilot
 let flight = null; // the flight on show: choice, moments, record, actions, ended, trunks
-let ghost = null; // another one through the same forest, and its label
-let [t, later] = [0, 0]; // the moment on show; the timer that writes the address
+let [ghost, plain] = [null, null]; // another one through the same forest, and its label; the one to go back to
+let t = 0; // the moment on show
 let [reasons, removed] = [null, null]; // the answer to "why" of moment t; what is taken out on show
 let [playing, busy] = [false, false]; // busy: a step is on its way
-let [generation, loops] = [0, 0]; // of flights and players: what an older one waited for is dropped
-const landed = []; // flights that were flown by hand to their end
+let [generation, asked] = [0, 0]; // of flights, and of what was asked: what an older one waited for is dropped
+const landed = new Map(); // flights that were flown by hand to their end; one that comes again counts once
 const stick = { held: {}, tapped: {}, side: 0, level: 0 };
 
 const world = () => options.worlds[chosen.world];
 const end = () => flight.moments.length - 1;
 const over = () => flight.ended !== "";
 const byHand = () => chosen.pilot === "you";
+const steers = () => byHand() && t === end() && !over();
 const straight = () => (world().actions - 1) / 2;
 const number = (x) => (Math.round(10 * x) / 10 || 0).toFixed(1).replace("-", "−"); // never −0.0
 const clock = (moment) => `${(moment * world().dt).toFixed(1)} s`;
 const signed = (x) => (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).replace(/^0/, "");
 const rate = (action) => signed(world().yaw_rate * (action / straight() - 1)); // rad/s
+const inWords = (a) => (a === straight() ? "flies straight on" : `turns ${a > straight() ? "left" : "right"} (${rate(a)} rad/s)`);
+const crossed = ({ record: { outcome, edge } }) => outcome === "goal" || edge === "far";
 const set = (node, values) => Object.entries(values).forEach(([key, x]) => node.setAttribute(key, x)) || node;
-const say = (text) => ($("hint").textContent = text);
+const say = (text) => void ($("hint").textContent === text || ($("hint").textContent = text)); // read aloud once
+const writeAddress = () => history.replaceState(null, "", `#${new URLSearchParams({ ...flight.choice, t, actions: flight.actions })}`);
 
 // -------------------------------------------------- the server
 async function post(path, content) {
@@ -58,15 +63,14 @@ async function attempt(action) {
 async function begin(actions, moment) {
   const me = ++generation;
   pause();
+  if (!/^[0-9]{1,18}$/.test(chosen.seed)) throw new Error("The forest is a whole number of at most 18 digits.");
   const found = await extend({ choice: chosen, moments: [] }, actions);
   if (me !== generation) return;
-  [flight, ghost] = [found, null];
+  [flight, ghost, plain] = [found, null, null];
   drawForest();
   setReasons(null);
   show(Math.min(moment || 0, end()));
-  if (!byHand() || over()) say("Drag the time line. Click a trunk or a bar to ask the network. Or take over, and do better.");
-  else if (actions) say("You have the controls: ← or → fly on from here, space flies straight on.");
-  else say("Press ← or → to take off. Hold to turn harder. The network flies along as a ghost.");
+  help();
   if (!byHand() && moment === null) play();
   while (!byHand() && !over()) {
     await extend(found, found.actions, 25, chosen.pilot);
@@ -76,20 +80,28 @@ async function begin(actions, moment) {
   if (chosen.pilot === "network") return;
   const other = await extend({ choice: chosen, label: "network", moments: [] }, "", world().max_steps);
   if (me !== generation) return;
-  ghost = ghost || other;
-  show(t);
+  [plain, ghost] = [other, ghost || other];
+  draw();
+}
+
+// What one can do now.
+function help() {
+  if (playing) say(steers() ? "Hold ← or → to turn harder. Space pauses." : "");
+  else if (!steers()) say("Drag the time line. Click a trunk or a bar to ask the network. Or take over, and do better.");
+  else if (t) say("You have the controls: ← or → fly on from here, space flies straight on.");
+  else say("Press ← or → to take off. Hold to turn harder. The network flies along as a ghost.");
 }
 
 async function steer() {
   if (busy) return;
   busy = true;
-  const [me, start] = [generation, performance.now()];
+  const [me, mine, start] = [generation, asked, performance.now()];
   await extend(flight, flight.actions + turn()).finally(() => (busy = false));
   if (me !== generation) return;
   show(end());
   requestAnimationFrame(() => performance.measure("step to picture", { start }));
+  if (mine === asked) help();
   if (!over()) return;
-  landed.push({ world: flight.choice.world, ...flight.record });
   pause();
   say(`You: ${flight.ended}. R flies this forest again, N the next one. Or drag the time line, and ask why.`);
 }
@@ -105,67 +117,91 @@ function turn() {
 function hold(side, down) {
   stick.held[side] = down ? 1 : 0;
   if (!down) return;
-  if (!byHand() || t < end()) return say("To steer from this moment on, press Take over here.");
-  if (over()) return say("This flight is over. R flies the forest again, N the next one.");
+  if (!steers()) pause(); // what was asked is dropped
+  if (!steers()) return say("To steer, go to a moment before the end and press Take over here. Or press R: the forest again.");
   stick.tapped[side] = 1;
   play();
 }
 
-async function whatIf(action) {
-  pause();
-  const [me, from] = [generation, t];
-  const other = { ...flight, label: `what if ${rate(action)} at ${clock(from)}`, whole: true, ended: "" };
+// As it was until moment `from`, then another turn for some steps, then the network to the end.
+async function otherwise(from, action, steps) {
+  const label = `what if ${rate(action)} at ${clock(from)}`;
+  const words = `The dashed way ${inWords(action)} at ${clock(from)} for ${clock(steps)}, then the network flies on`;
+  const other = { ...flight, from, label, words, whole: true, ended: "" };
   [other.moments, other.actions] = [flight.moments.slice(0, from), flight.actions.slice(0, from)];
   // The turn may end the flight, and no action can follow that.
-  for (let i = 0; i < Number($("hold").value) && !other.ended; i++) await extend(other, other.actions + action);
-  await extend(other, other.actions, world().max_steps);
-  if (me !== generation) return;
-  ghost = other;
-  show(from);
-  say(`The dashed way, ${other.label}: ${other.ended}, total reward ${number(other.record.return)}.`);
+  for (let i = 0; i < steps && !other.ended; i++) await extend(other, other.actions + action);
+  return extend(other, other.actions, world().max_steps);
 }
 
-// The greatest Q is what the network expects from here on. Where it falls most, it was surprised.
-function wentWrong() {
+async function whatIf(action) {
   pause();
-  const best = flight.moments.slice(0, -1).map(({ q }) => Math.max(...q));
-  const falls = best.slice(1).map((x, i) => best[i] - x);
-  if (!falls.length) return say("Fly first.");
-  const worst = falls.indexOf(Math.max(...falls));
-  show(worst);
-  say(`After ${clock(worst)} the greatest Q falls most, from ${number(best[worst])} to ${number(best[worst + 1])}. Step on, and see.`);
+  if (t === end() && over()) return say("The flight ends here. Step back, and ask again.");
+  const me = asked;
+  const other = await otherwise(t, action, Number($("hold").value));
+  if (me !== asked) return;
+  ghost?.words === other.words ? clear() : compare(other); // the same bar again takes it away
+}
+
+function compare(other, known = "") {
+  ghost = other;
+  show(other.from);
+  say(`${known}${other.words}: ${other.ended}, total reward ${number(other.record.return)}. Esc, or the same bar, takes it away.`);
+}
+
+function clear() {
+  pause();
+  ghost = plain;
+  setReasons(null);
+  draw();
+}
+
+// The last moment at which another turn saves the flight. It is flown, so the answer is exact.
+async function wentWrong() {
+  pause();
+  if (!over()) return say("This flight is not over. Fly it to its end first.");
+  if (crossed(flight)) return say(`Nothing went wrong: ${flight.ended}.`);
+  const [me, steps] = [asked, Math.round(0.5 / world().dt)];
+  let from = end();
+  while (from >= steps && from > end() - 10 * steps) {
+    from -= steps;
+    say(`The network tries whether another turn at ${clock(from)} would have saved it.`);
+    for (const action of [2 * straight(), straight(), 0]) {
+      const other = await otherwise(from, action, steps);
+      if (me !== asked) return;
+      if (crossed(other)) return compare(other, `The last way out was at ${clock(from)}. `);
+    }
+  }
+  const best = flight.moments.map(({ q }) => Math.max(...q));
+  const falls = best.slice(1, -1).map((x, i) => best[i] - x);
+  show(Math.max(falls.indexOf(Math.max(...falls)), 0));
+  say(`Nothing saves it: left, straight on and right for 0.5 s were tried at each half second from ${clock(from)} on.
+    After ${clock(t)} the greatest Q falls most. That counts only for weights learnt from rewards.`);
 }
 
 // -------------------------------------------------- why
 async function why(trunk = null) {
   pause();
-  const [me, at] = [generation, t];
+  const [me, at] = [asked, t];
   const answer = reasons || (await ask("/why", flight.choice, { actions: flight.actions, time: String(at) }));
-  if (me !== generation || at !== t) return;
-  setReasons(answer, trunk);
+  if (me !== asked || at !== t) return;
+  setReasons(answer, removed && removed.trunk === trunk ? null : trunk);
   draw();
-  if (trunk !== null && !removed) say("That is in none of the four pictures: without it nothing would change.");
+  if (trunk !== null && answer.without.every((x) => x.trunk !== trunk)) say("That is in none of the four pictures: without it nothing would change.");
 }
 
 function setReasons(answer, trunk = null) {
-  reasons = answer;
-  removed = (answer && answer.without.find((x) => x.trunk === trunk)) || null;
-  $("answer").replaceChildren(...(answer ? describeReasons() : []));
-  drawTrunks();
-}
-
-function describeReasons() {
-  const [text, row] = [document.createElement("p"), document.createElement("div")];
-  text.innerHTML = `It would turn <b>${rate(reasons.chosen)}</b> rad/s. How much this turn's lead over the mean Q owes
-    to each thing in view: <span class="for">a reason for it</span>, <span class="against">a reason against</span>.`;
-  row.className = "row";
-  const strongest = [...reasons.without].sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight));
-  for (const x of strongest.slice(0, 8)) {
+  const things = answer ? [...answer.without].sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight)) : [];
+  [reasons, removed] = [answer, things.find((x) => x.trunk === trunk) || null];
+  $("answer").hidden = !answer;
+  $("turn").textContent = answer ? rate(answer.chosen) : "";
+  $("things").replaceChildren();
+  for (const x of things.slice(0, 8)) {
     const name = x.trunk < 0 ? "the goal's pole" : `trunk ${whereabouts(flight.trunks[x.trunk])}`;
-    const button = addButton(row, `${name} ${signed(x.weight)}`, () => attempt(() => why(x === removed ? null : x.trunk)));
+    const button = addButton($("things"), `${name} ${signed(x.weight)}`, () => attempt(() => why(x.trunk)));
     set(button, { class: x.weight > 0 ? "for" : "against", "aria-pressed": x === removed });
   }
-  return [text, row];
+  drawTrunks();
 }
 
 function whereabouts([x, y]) {
@@ -187,17 +223,17 @@ const play = () => playing || setPlaying(true);
 const pause = () => setPlaying(false);
 
 function setPlaying(on) {
-  playing = on;
+  [playing, asked] = [on, asked + 1];
   $("play").textContent = on ? "Pause" : "Play";
+  if (flight) help();
   if (on) attempt(loop);
-  else remember();
 }
 
 async function loop() {
-  const me = ++loops;
+  const me = asked;
   let due = performance.now();
   if (t === end() && over()) show(0);
-  while (playing && me === loops) {
+  while (playing && me === asked) {
     if (t < end()) show(t + 1);
     else if (over()) pause();
     else if (byHand()) await steer();
@@ -207,24 +243,26 @@ async function loop() {
 }
 
 function stepTo(moment) {
+  show(Math.max(Math.min(moment, end()), 0));
   pause();
-  if (moment <= end()) show(Math.max(moment, 0));
-  else if (byHand() && !over()) attempt(steer);
+  if (moment > end() && steers()) attempt(steer);
 }
 
 function show(moment) {
   if (moment !== t && reasons) setReasons(null);
   t = moment;
+  const { choice, record } = flight;
+  if (choice.pilot === "you" && over()) landed.set(`${choice.world} ${record.seed} ${record.actions}`, { world: choice.world, ...record });
   draw();
-  if (!playing) remember();
 }
 
 // -------------------------------------------------- drawing
 function drawForest() {
-  const { length, width, back, actions } = world();
+  const { length, width, back, actions, beacon } = world();
   set($("map"), { viewBox: `-4 ${-width / 2 - 2} ${length + 8} ${width + 4}` });
   set($("ground"), { x: -back, y: -width / 2, width: length + back, height: width });
-  set($("goal"), { cx: length, cy: 0 });
+  set($("goal"), { cx: length });
+  set($("pole"), { cx: length, r: beacon ? 0.7 : 0 });
   const circle = ([cx, y]) => set(document.createElementNS("http://www.w3.org/2000/svg", "circle"), { cx, cy: -y });
   $("trunks").replaceChildren(...flight.trunks.map(circle));
   for (let a = actions - 1; a >= 0 && $("bars").children.length < actions; a--) {
@@ -242,8 +280,7 @@ function draw() {
   set($("time"), { "aria-valuetext": clock(t) });
   $("clock").textContent = `${clock(t)} of ${clock(end())}`;
   const landing = t === end() && over() && `${flight.ended}, total reward ${number(flight.record.return)}`;
-  const hint = byHand() && !end() && "← or → to take off";
-  $("banner").textContent = removed ? `without ${removed.trunk < 0 ? "the goal's pole" : "this trunk"}` : landing || hint || "";
+  $("banner").textContent = removed ? `without ${removed.trunk < 0 ? "the goal's pole" : "this trunk"} (Esc puts it back)` : landing || "";
 }
 
 function paint(canvas, frame) {
@@ -266,8 +303,7 @@ function drawMap() {
   set($("ghost-way"), { points: way(known) });
   const at = ghost && ghost.moments[Math.min(t, ghost.moments.length - 1)].pose;
   set($("ghost"), { transform: at ? place(at) : "translate(-99 0)" });
-  $("main-name").textContent = chosen.pilot;
-  $("ghost-name").textContent = ghost ? ghost.label : "";
+  [$("main-name").textContent, $("ghost-name").textContent] = [chosen.pilot, ghost ? ghost.label : ""];
   $("ghost-mark").hidden = !ghost;
 }
 
@@ -299,33 +335,25 @@ function drawBars() {
 }
 
 function drawCurves() {
-  for (const row of $("curves").children) {
-    const [label, svg] = row.children;
-    const values = flight.moments.map((moment) => moment[row.dataset.key]);
+  const curve = ([key, name]) => {
+    const values = flight.moments.map((moment) => moment[key]);
     const [low, high] = [Math.min(0, ...values), Math.max(1, ...values)];
     const x = (moment) => ((100 * moment) / Math.max(end(), 1)).toFixed(2);
-    const y = (value) => (30 - (30 * (value - low)) / (high - low)).toFixed(2);
-    set(svg.children[0], { d: `M${values.map((value, moment) => `${x(moment)} ${y(value)}`).join("L")}` });
-    set(svg.children[1], { d: `M${x(t)} 0V30` });
-    label.lastChild.textContent = number(values[t]);
-  }
+    const points = values.map((value, moment) => `${x(moment)} ${(30 - (30 * (value - low)) / (high - low)).toFixed(2)}`);
+    return `<div class="curve"><span>${name} <b>${number(values[t])}</b></span><svg viewBox="0 0 100 30" preserveAspectRatio="none"
+      aria-hidden="true"><path d="M${points.join("L")}"/><path d="M${x(t)} 0V30"/></svg></div>`;
+  };
+  const curves = { reward: "reward", return: "total reward", d_obs: "nearest bark, m" };
+  $("curves").innerHTML = Object.entries(curves).map(curve).join("");
 }
 
 function drawTable() {
-  const yes = (x) => (x ? "yes" : "no");
-  const rows = {
-    end: (x, ended) => ended,
-    steps: (x) => x.steps,
-    crossed: (x) => yes(x.outcome === "goal" || x.edge === "far"),
-    crashed: (x) => yes(x.outcome === "crash"),
-    arrived: (x) => yes(x.outcome === "goal"),
-    "total reward": (x) => number(x.return),
-  };
   const flights = [{ ...flight, label: chosen.pilot }, ghost].filter(Boolean);
-  const line = (name, cells) => `<tr><th scope="row">${name}</th>${cells.map((x) => `<td>${x}</td>`).join("")}</tr>`;
   const known = (f) => f.ended && (over() || f.whole);
-  const body = Object.entries(rows).map(([name, row]) => line(name, flights.map((f) => (known(f) ? row(f.record, f.ended) : "…"))));
-  $("table").innerHTML = line("", flights.map((f) => `<b>${f.label}</b>`)) + body.join("");
+  const rows = { end: (f) => f.ended, steps: (f) => f.record.steps, "total reward": (f) => number(f.record.return) };
+  const line = (name, cell) => `<tr><th scope="row">${name}</th>${flights.map((f) => `<td>${cell(f)}</td>`).join("")}</tr>`;
+  const body = Object.entries(rows).map(([name, cell]) => line(name, (f) => (known(f) ? cell(f) : "…")));
+  $("table").innerHTML = line("", (f) => `<b>${f.label}</b>`) + body.join("");
 }
 
 // -------------------------------------------------- choices, address, file
@@ -350,21 +378,15 @@ function drawChoices() {
   const names = { pilot: options.pilots, world: Object.keys(options.worlds) };
   for (const [key, all] of Object.entries(names)) {
     const row = $(`${key}s`);
-    if (!row.children.length) all.forEach((name) => addButton(row, name, () => choose(key === "world" ? { world: name, weights: "" } : { pilot: name })));
+    const add = (name) => addButton(row, name, () => choose(key === "world" ? { world: name, weights: "" } : { pilot: name }));
+    if (!row.children.length) all.forEach((name) => set(add(name), { title: MEANING[name] || "" }));
     for (const button of row.children) set(button, { "aria-pressed": button.textContent === chosen[key] });
     if (key === "world") all.forEach((name, i) => (row.children[i].disabled = !options.worlds[name].weights.length));
   }
   $("weights").replaceChildren(...world().weights.map((name) => new Option(name, name, false, name === chosen.weights)));
   $("seed").value = chosen.seed;
+  $("stick").hidden = !byHand();
 }
-
-function remember() {
-  clearTimeout(later); // browsers complain if the address changes many times a second
-  later = setTimeout(() => flight && writeAddress(), 150);
-}
-
-const address = () => new URLSearchParams({ ...flight.choice, t, actions: flight.actions });
-const writeAddress = () => history.replaceState(null, "", `#${address()}`);
 
 async function restore() {
   const told = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
@@ -377,21 +399,26 @@ async function restore() {
 }
 
 async function share() {
+  pause();
   writeAddress();
-  await navigator.clipboard.writeText(location.href).catch(() => null);
-  say("The address of this page holds this flight at this moment. It is copied: paste it anywhere.");
+  const copied = await navigator.clipboard.writeText(location.href).then(() => " It is copied.", () => "");
+  say(`The address of this page holds this flight at this moment.${copied} It opens where a cockpit runs at ${location.host}.`);
 }
 
 function save() {
-  const flights = landed.filter((f) => f.world === chosen.world && f.seed < options.train_end);
-  if (!flights.length) return say("Fly to an end first, in a forest below 1,000,000,000: the others are for tests.");
+  pause();
+  const flights = [...landed.values()].filter((f) => f.world === chosen.world && f.seed < options.train_end);
+  const out = landed.size - flights.length;
+  const left = out ? ` Left out: ${out}, of another world, or of a forest from 1,000,000,000 up (those are for tests).` : "";
+  if (!flights.length) return say(`There is no flight to save. Fly by hand to an end, in a forest below 1,000,000,000.${left}`);
   const { beacon, camera } = world();
-  const head = { program: "Deep Flight", weights: chosen.weights, beacon, camera, first_seed: flights[0].seed };
+  const head = { program: "Deep Flight", weights: chosen.weights, beacon, camera, first_seed: flights[0].seed, forests: flights.length };
   const pilots = { you: { flights: flights.map(({ world, ...record }) => record) } };
-  const file = new Blob([JSON.stringify({ ...head, forests: flights.length, pilots })], { type: "application/json" });
+  const file = new Blob([JSON.stringify({ ...head, pilots })], { type: "application/json" });
   Object.assign(document.createElement("a"), { href: URL.createObjectURL(file), download: "flights.json" }).click();
   const flags = (beacon ? " --beacon" : "") + (camera === "grey" ? "" : ` --camera ${camera}`);
-  say(`Flights by hand: ${flights.length}. Teach with them: python deepflight.py train --demos flights.json${flags}`);
+  say(`Flights in the file flights.json: ${flights.length}.${left}
+    To teach: .venv/bin/python deepflight.py train --demos FILE${flags}\n To compare: .venv/bin/python deepflight.py eval --pilots FILE dqn${flags}`);
 }
 
 // -------------------------------------------------- keys and buttons
@@ -403,10 +430,11 @@ const actions = {
   again: () => choose({}),
   random: () => choose({ seed: String(Math.floor(Math.random() * options.train_end)) }),
   why: () => attempt(() => why()),
-  take: () => choose({ pilot: "you" }, flight.actions.slice(0, t), t),
-  wrong: wentWrong, share, save,
+  take: () => choose({ pilot: "you" }, flight.actions.slice(0, over() ? Math.min(t, end() - 1) : t), t),
+  wrong: () => attempt(wentWrong),
+  clear, share, save,
 };
-const KEYS = { " ": "play", ",": "back", ".": "step", n: "next", r: "again", w: "why" };
+const KEYS = { " ": "play", ",": "back", ".": "step", n: "next", r: "again", w: "why", Escape: "clear" };
 const SIDES = { ArrowLeft: "left", a: "left", ArrowRight: "right", d: "right" };
 
 function key(event) {
@@ -440,8 +468,9 @@ function listen() {
 }
 
 attempt(async () => {
-  for (const canvas of $("stack").children) canvas.width = canvas.height = PIXELS;
   options = await post("/options", {});
   listen();
   await restore();
+  // Not at each change, because browsers complain if the address changes many times a second.
+  setInterval(() => flight && !playing && writeAddress(), 500);
 });

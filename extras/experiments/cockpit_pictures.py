@@ -102,9 +102,9 @@ def latencies(browser: webdriver.Chrome, host: str) -> dict[str, list[float]]:
     """Milliseconds of every step while the network's ghost flies along, and of ten questions."""
     visit(browser, host, seed=42)
     script = "performance.getEntriesByName('step to picture').map((entry) => entry.duration)"
-    for i in range(4):
+    for _ in range(4):
         ActionChains(browser).send_keys(Keys.SPACE).perform()
-        until(browser, f"landed.length > {i}")
+        until(browser, "over()")
         value(browser, "actions.again()")
     steps = value(browser, script)
     visit(browser, host, seed=42, pilot="network", t=0)

@@ -6,6 +6,7 @@ Skipped where Debian's packages chromium and chromium-driver are missing.
 import json
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from deepflight import dqn_pilot, read_flights
-from dqn import load_weights
+from dqn import QNetwork, load_weights
 from env import ForestEnv, World, fly, refly
 from extras.cockpit.flights import ROOT
 from extras.experiments.cockpit_pictures import (
@@ -82,9 +83,8 @@ def steered(browser: Chrome, host: str) -> dict:
     """Fly forest 1 by hand to its end, with some turns; the flight's record."""
     visit(browser, host, seed=SEED)
     browser.execute_script("document.getElementById('speed').value = '5'")
-    landed = value(browser, "landed.length")
     press(browser, Keys.ARROW_LEFT)
-    until(browser, f"landed.length > {landed}")
+    until(browser, "over() && landed.size")
     return value(browser, "flight.record")
 
 
@@ -184,6 +184,13 @@ def test_a_click_on_a_trunk_takes_it_out_of_the_decision(browser: Chrome, host: 
     bars = browser.find_elements(By.CSS_SELECTOR, "#bars .after")
     shown = [float(bar.text.replace("\N{MINUS SIGN}", "-")) for bar in reversed(bars)]
     assert shown == pytest.approx(values, abs=0.051)
+    ActionChains(browser).move_to_element(circle).click().perform()
+    until(browser, "reasons && !removed")
+    ActionChains(browser).move_to_element(circle).click().perform()
+    until(browser, "removed")
+    press(browser, Keys.ESCAPE)
+    assert value(browser, "[reasons, removed]") == [None, None]
+    assert not any(bar.text for bar in bars)
 
 
 def test_what_if_flies_both_ways(browser: Chrome, host: str) -> None:
@@ -196,11 +203,90 @@ def test_what_if_flies_both_ways(browser: Chrome, host: str) -> None:
     assert len(value(browser, "ghost.moments")) == len(actions) + 1
 
 
-def test_where_it_went_wrong_is_where_the_greatest_q_falls_most(browser: Chrome, host: str) -> None:
-    visit(browser, host, seed=SEED, weights="scratch", pilot="network", t=0)
+def test_escape_brings_the_plain_ghost_back(browser: Chrome, host: str) -> None:
+    visit(browser, host, seed=SEED, actions="4444")
+    value(browser, "whatIf(8)")
+    assert text(browser, "hint").startswith("The dashed way turns left (+.70 rad/s) at ")
+    press(browser, Keys.ESCAPE)
+    assert value(browser, "ghost.label") == "network"
+    assert "dashed" not in text(browser, "hint")
+    value(browser, "whatIf(8)")
+    value(browser, "whatIf(8)")  # the same bar again
+    assert value(browser, "ghost.label") == "network"
+
+
+def saves(seed: int, actions: str, q: QNetwork) -> bool:
+    """Whether the network crosses if it goes on after these actions; they may not crash."""
+    rest, pilot = iter([[int(action)] for action in actions]), dqn_pilot(q)
+    (flight,) = fly(lambda fleet: next(rest, None) or pilot(fleet), [seed], World())
+    return flight["outcome"] == "goal" or flight["edge"] == "far"
+
+
+def test_it_went_wrong_at_the_last_moment_with_a_way_out(browser: Chrome, host: str) -> None:
+    q = load_weights(ROOT / "weights/paper.pt", 9, beacon=False, camera="grey")
+    visit(browser, host, seed=2, pilot="network", t=0)
+    actions, end = value(browser, "flight.actions"), value(browser, "end()")
     click(browser, "wrong")
+    until(browser, "ghost")
+    ways = [(end - 5 * i, turn) for i in range(1, 11) for turn in "840"]
+    t, turn = next((t, turn) for t, turn in ways if saves(2, actions[:t] + 5 * turn, q))
+    assert value(browser, "t") == t
+    assert value(browser, "ghost.actions")[: t + 5] == actions[:t] + 5 * turn
+    assert value(browser, "ghost.record") == fly_again(value(browser, "ghost.record"))
+    assert value(browser, "crossed(ghost)") is True
+    assert f"The last way out was at {t / 10} s. The dashed way turns left" in text(browser, "hint")
+
+
+def test_a_flight_that_crossed_did_not_go_wrong(browser: Chrome, host: str) -> None:
+    visit(browser, host, seed=7, pilot="network", t=0)
+    click(browser, "wrong")
+    assert text(browser, "hint").startswith("Nothing went wrong: ")
+    visit(browser, host, seed=7, actions="44")
+    click(browser, "wrong")
+    assert text(browser, "hint").startswith("This flight is not over.")
+
+
+def test_where_nothing_saves_it_the_greatest_q_falls_most(browser: Chrome, host: str) -> None:
+    visit(browser, host, seed=2, pilot="network", t=0)
+    browser.execute_script("window.otherwise = async () => flight")  # each way ends as badly
     best = np.max([moment["q"] for moment in value(browser, "flight.moments")[:-1]], 1)
+    value(browser, "wentWrong()")
     assert value(browser, "t") == int(np.argmax(best[:-1] - best[1:]))
+    assert "only for weights learnt from rewards" in text(browser, "hint")
+
+
+def test_any_other_action_ends_the_search(browser: Chrome, host: str) -> None:
+    for key in (Keys.SPACE, Keys.ESCAPE, ",", "w", Keys.ARROW_LEFT):
+        visit(browser, host, seed=2, pilot="network", t=20)
+        browser.execute_script("window.search = wentWrong()")
+        assert text(browser, "hint").startswith("The network tries")
+        press(browser, key)
+        value(browser, "search")
+        assert value(browser, "[ghost, t < 40]") == [None, True]
+        assert "way out" not in text(browser, "hint")
+
+
+def test_the_line_on_top_is_about_the_last_action(browser: Chrome, host: str) -> None:
+    visit(browser, host, seed=SEED)
+    press(browser, Keys.ARROW_LEFT)
+    until(browser, "end() >= 2")
+    assert text(browser, "hint") == "Hold ← or → to turn harder. Space pauses."
+    press(browser, Keys.SPACE)
+    assert text(browser, "hint").startswith("You have the controls")
+    value(browser, "why(149)")
+    assert text(browser, "hint").startswith("That is in none of the four pictures")
+    click(browser, "why")
+    assert text(browser, "hint").startswith("You have the controls")
+
+
+def test_a_bad_number_of_a_forest_is_refused_in_words(browser: Chrome, host: str) -> None:
+    visit(browser, host, seed=SEED)
+    for number in ("1" * 19, "-1", "1.5", "x", ""):
+        field = browser.find_element(By.ID, "seed")
+        field.clear()
+        field.send_keys(number, Keys.ENTER)
+        until(browser, "$('seed').value === '1'")
+        assert text(browser, "hint") == "The forest is a whole number of at most 18 digits."
 
 
 def test_taking_over_keeps_the_way_so_far(browser: Chrome, host: str) -> None:
@@ -211,6 +297,14 @@ def test_taking_over_keeps_the_way_so_far(browser: Chrome, host: str) -> None:
     press(browser, ".")
     until(browser, "end() === 21")
     assert value(browser, "flight.actions") == before[:20] + "4"
+
+
+def test_taking_over_at_the_end_leaves_a_moment_to_fly(browser: Chrome, host: str) -> None:
+    visit(browser, host, seed=SEED, pilot="network", t=1000)
+    before = value(browser, "flight.actions")
+    click(browser, "take")
+    until(browser, "byHand() && ghost")
+    assert value(browser, "[flight.actions, over(), landed.size]") == [before[:-1], False, 0]
 
 
 def test_the_address_restores_flight_and_moment(browser: Chrome, host: str) -> None:
@@ -231,25 +325,59 @@ def test_a_bad_address_gets_a_line_and_a_flight(browser: Chrome, host: str) -> N
     browser.get("about:blank")
     browser.get(f"http://{host}/#world=moon&weights=x&seed=-1&actions=99&t=-3.5")
     until(browser, "flight && ghost")
-    assert text(browser, "hint").startswith("seed is '-1'")
+    assert text(browser, "hint") == "The forest is a whole number of at most 18 digits."
+    browser.get("about:blank")
+    browser.get(f"http://{host}/#world=moon&weights=x&seed=1&actions=99&t=-3.5")
+    until(browser, "flight && ghost")
+    assert text(browser, "hint").startswith("actions is '99'")
     refused = "400 (Bad Request)"  # the browser itself writes these
     assert all(refused in entry["message"] for entry in browser.get_log("browser"))
 
 
+def saved(browser: Chrome) -> Path:
+    """What a click on Save writes."""
+    file = browser.downloads / "flights.json"
+    file.unlink(missing_ok=True)
+    click(browser, "save")
+    WebDriverWait(browser, 30).until(lambda _: file.exists())
+    return file
+
+
 def test_saved_flights_train(browser: Chrome, host: str) -> None:
     record = steered(browser, host)
-    click(browser, "save")
-    file = browser.downloads / "flights.json"
-    WebDriverWait(browser, 30).until(lambda _: file.exists())
-    flown = read_flights(file, False)[-1]
+    file = saved(browser)
+    (flown,) = read_flights(file, False)
     assert (flown["seed"], flown["actions"]) == (record["seed"], record["actions"])
     report = json.loads(file.read_text())
     assert report["program"] == "Deep Flight"
     assert math.isclose(report["pilots"]["you"]["flights"][-1]["return"], record["return"])
 
 
+def test_a_flight_by_hand_that_comes_back_is_saved_once(browser: Chrome, host: str) -> None:
+    record = steered(browser, host)
+    shared = {"seed": SEED, "actions": record["actions"], "t": 3}
+    visit(browser, host, **shared)
+    assert [flown["actions"] for flown in read_flights(saved(browser), False)] == [
+        record["actions"]
+    ]
+    value(browser, "choose({}, flight.actions)")
+    assert len(read_flights(saved(browser), False)) == 1
+    value(browser, "choose({ seed: '2000000000', pilot: 'straight' })")
+    value(browser, "choose({ pilot: 'you' }, flight.actions)")
+    value(browser, "choose({ world: 'beacon', weights: '' })")
+    click(browser, "save")
+    assert text(browser, "hint").startswith("There is no flight to save.")
+    assert "Left out: " in text(browser, "hint")
+
+
 @pytest.mark.parametrize("width", [390, 1280])
-def test_the_page_is_no_wider_than_the_window(host: str, width: int) -> None:
+def test_the_page_is_no_wider_than_the_window_and_the_time_line_stays_in_it(
+    host: str, width: int
+) -> None:
     with browsing(width, 844) as narrow:
         visit(narrow, host)
         assert value(narrow, "document.documentElement.scrollWidth") <= width
+        size = {"width": width, "height": 500, "deviceScaleFactor": 1, "mobile": False}
+        narrow.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        bottom = "document.querySelector('footer').getBoundingClientRect().bottom"
+        assert value(narrow, f"{bottom} <= innerHeight")
