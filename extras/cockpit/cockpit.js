@@ -13,7 +13,7 @@ let t = 0; // the moment on show
 let [reasons, removed] = [null, null]; // the answer to "why" of moment t; what is taken out on show
 let [playing, busy] = [false, false]; // busy: a step is on its way
 let [generation, asked] = [0, 0]; // of flights, and of what was asked: what an older one waited for is dropped
-const landed = new Map(); // flights that were flown by hand to their end; one that comes again counts once
+const landed = new Map(JSON.parse(sessionStorage.landed || "[]")); // flown by hand to their end, each once
 const stick = { held: {}, tapped: {}, side: 0, level: 0 };
 
 const world = () => options.worlds[chosen.world];
@@ -169,7 +169,7 @@ async function wentWrong() {
     for (const action of [2 * straight(), straight(), 0]) {
       const other = await otherwise(from, action, steps);
       if (me !== asked) return;
-      if (crossed(other)) return compare(other, `The last way out was at ${clock(from)}. `);
+      if (crossed(other)) return compare(other, `Of each half second, the last way out was at ${clock(from)}. `);
     }
   }
   const best = flight.moments.map(({ q }) => Math.max(...q));
@@ -230,8 +230,7 @@ function setPlaying(on) {
 }
 
 async function loop() {
-  const me = asked;
-  let due = performance.now();
+  let [me, due] = [asked, performance.now()];
   if (t === end() && over()) show(0);
   while (playing && me === asked) {
     if (t < end()) show(t + 1);
@@ -252,7 +251,8 @@ function show(moment) {
   if (moment !== t && reasons) setReasons(null);
   t = moment;
   const { choice, record } = flight;
-  if (choice.pilot === "you" && over()) landed.set(`${choice.world} ${record.seed} ${record.actions}`, { world: choice.world, ...record });
+  const name = `${choice.world} ${record.seed} ${record.actions}`;
+  if (choice.pilot === "you" && over()) sessionStorage.landed = JSON.stringify([...landed.set(name, { world: choice.world, ...record })]);
   draw();
 }
 

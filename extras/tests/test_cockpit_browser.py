@@ -53,9 +53,10 @@ def chromium() -> Iterator[Chrome]:
 
 @pytest.fixture
 def browser(chromium: Chrome) -> Iterator[Chrome]:
-    """No test may leave a line on the console."""
+    """No test may leave a line on the console, or a flight to be saved."""
     chromium.get_log("browser")
     yield chromium
+    chromium.execute_script("sessionStorage.clear()")
     assert [entry["message"] for entry in chromium.get_log("browser")] == []
 
 
@@ -234,7 +235,10 @@ def test_it_went_wrong_at_the_last_moment_with_a_way_out(browser: Chrome, host: 
     assert value(browser, "ghost.actions")[: t + 5] == actions[:t] + 5 * turn
     assert value(browser, "ghost.record") == fly_again(value(browser, "ghost.record"))
     assert value(browser, "crossed(ghost)") is True
-    assert f"The last way out was at {t / 10} s. The dashed way turns left" in text(browser, "hint")
+    assert (
+        f"Of each half second, the last way out was at {t / 10} s. The dashed way turns left"
+        in text(browser, "hint")
+    )
 
 
 def test_a_flight_that_crossed_did_not_go_wrong(browser: Chrome, host: str) -> None:
@@ -351,6 +355,14 @@ def test_saved_flights_train(browser: Chrome, host: str) -> None:
     report = json.loads(file.read_text())
     assert report["program"] == "Deep Flight"
     assert math.isclose(report["pilots"]["you"]["flights"][-1]["return"], record["return"])
+
+
+def test_a_reload_keeps_every_flight_by_hand(browser: Chrome, host: str) -> None:
+    record = steered(browser, host)
+    visit(browser, host, seed=SEED + 1, pilot="network", t=0)
+    assert [flown["actions"] for flown in read_flights(saved(browser), False)] == [
+        record["actions"]
+    ]
 
 
 def test_a_flight_by_hand_that_comes_back_is_saved_once(browser: Chrome, host: str) -> None:
