@@ -15,6 +15,8 @@ The words, for this drone
 Q(s, a) is the expected return of a drone that takes action a in state s, and the best action in
 every later state. "Expected" means the average over all that the drone cannot know, such as the
 trunks behind the next one. A drone that knows Q can fly: it takes the action whose Q is greatest.
+(`train` learns Q, as this file says. `train --teacher`, which made the shipped pilot, copies a
+planner. It uses the network and the replay below, and none of the labels.)
 
 A neural network learns Q. It is a function with 1.7 million adjustable numbers, its weights. Four
 pictures go in. Nine numbers come out, one for each action. It learns from examples, each an input
