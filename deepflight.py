@@ -132,9 +132,9 @@ def learner_reward(r: ndarray, infos: Sequence[dict], rc: RunConfig, gamma: floa
     The field calls this reward shaping. A policy is a rule that picks the action in every state.
     One kind of it leaves the best policy as it is: what it pays for a step forward, it takes for
     the step back (potential-based shaping [Ng 1999]). It pays gamma * P(s2) - P(s), where P is any
-    function of the state. The pay for metres is that with P = 2 * x, but for gamma. The prizes are
-    not, and are meant to change the policy. All this is for the network alone. Every reward that is
-    printed or logged is the paper's.
+    function of the state. With P = 2 * x it pays 2 * (gamma * x2 - x). We pay 2 * (x2 - x), which
+    is nearly that. The prizes are not of that kind, and are meant to change the policy. All this is
+    for the network alone. Every reward that is printed or logged is the paper's.
     """
     forward = np.array([info["forward"] for info in infos])  # (L,) m
     arrived = np.array([info["outcome"] == "goal" for info in infos])  # (L,)

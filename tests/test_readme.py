@@ -88,6 +88,8 @@ def test_the_pages_count_how_the_headline_flights_ended() -> None:
     said = said.format_map(paper)
     assert f"Of its 1,000 flights {said} It fails late: {late:.0%}"[:-1] + " % of all" in FLAT
     crossed = report("paper")["pilots"]["dqn"]["crossed"]["value"]
+    few = report("eval")["pilots"]["dqn"]["crossed"]["value"]
+    assert f"Its {100 * few:.0f} is luck" in FLAT
     assert f"of 1,000 it crosses {100 * crossed:.0f} %." in FLAT
     assert f"With the beacon {1000 - beacon['goal']} flights did not arrive" in FLAT
     assert f"and {beacon['crash']} of these crashed" in FLAT
