@@ -2,7 +2,7 @@
 
     python deepflight.py train                  the default recipe, in the paper's world
     python deepflight.py train --beacon         where a pole makes the goal visible
-    python deepflight.py train --camera disparity   by how near things are, not how bright
+    python deepflight.py train --camera disparity    pictures say how near things are
     python deepflight.py train --teacher        a planner with a laser says what turns are worth
     python deepflight.py train --demos FILE     learn first from flights that eval --json wrote
     python deepflight.py train --preset dqn     textbook DQN, but with Adam and eight drones
@@ -10,6 +10,7 @@
     python deepflight.py train --resume DIR     go on with an interrupted training
     python deepflight.py eval                   fly weights/paper.pt against three other pilots
     python deepflight.py eval --beacon          fly weights/beacon.pt where the goal is visible
+    python deepflight.py eval --pilots FILE dqn    recorded flights, and dqn in the same forests
 
 The story stands first: the settings, what the network is paid, `train`, teachers, `evaluate`.
 Statistics, film and plumbing (files, signals, clocks, the command line) stand last. Skip them at
@@ -288,7 +289,7 @@ def learn(agent: Agent, b: dqn.Batch, c: DQNConfig) -> None:
 # greatest of the nine, by a margin (dqn.margin_loss) [Hester 2018]. The network learns from these
 # flights alone at first. Their rewards count like others. With `--demo-share 0.25` a quarter of
 # each later batch is theirs too. Then `--epsilon-decay 40000` is needed, so that the drone explores
-# as usual: demonstrated flights do not crash, and Q sees a crash coming only if it has seen many.
+# as usual. Demonstrated flights do not crash, and who has seen few crashes does not see one coming.
 
 
 def teach(fleet: Fleet, c: DQNConfig, rc: RunConfig) -> ndarray | float:
@@ -745,7 +746,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         sub.add_argument("--" + f.name.replace("_", "-"), help=describe(f), **kind)
     sub = commands.add_parser("eval", help="fly trained weights against three other pilots")
     sub.set_defaults(run=evaluate)
-    sub.add_argument("--weights", type=place, help="default: weights/paper.pt or weights/beacon.pt")
+    sub.add_argument("--weights", type=place, help="default: those shipped for this world")
     of = f"of {', '.join(PILOTS)}; default: all. Or one file of eval --json: then its forests"
     sub.add_argument("--pilots", nargs="+", default=PILOTS, metavar="PILOT", help=of)
     more = {"choices": render.CAMERAS, "default": "grey", "metavar": "KIND"}

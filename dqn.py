@@ -250,7 +250,7 @@ def td_target(r: Tensor, gamma_n: Tensor, end: Tensor, q2: Tensor, q2_online: Te
 
     r, gamma_n, end (B,). Only TERMINAL stops the sum: a time limit ends the flight, but not the
     world. q2 (B, A): Q^(s2, .), which says what an action is worth. q2_online (B, A): the values by
-    which a2 is chosen: those of Q, which learns on line. In the textbook these are q2 too.
+    which a2 is chosen. With [+double] they are Q(s2, .); in the textbook they are q2 too.
 
     [+double] Let two actions both be worth 0 in truth, and let Q^ err by +1 and -1. A max picks
     whatever error points upwards: it is 1, too high. Let Q choose a2 instead. If its errors had
@@ -487,8 +487,8 @@ class RMSprop(torch.optim.Optimizer):
 def make_optimizer(theta: Iterable[Tensor], c: DQNConfig) -> torch.optim.Optimizer:
     """[+adam] Adam keeps two running means for each weight: m of its gradient g, and v of g^2. A
     running mean goes a small part of the way to each number that comes: m = 0.9 * m + 0.1 * g.
-    The weight moves by -lr * m / sqrt(v). So all weights move at a like pace, whether their
-    gradients are large or small. Without it: the RMSprop of [Mnih15]. theta: the weights."""
+    The weight moves by -lr * m / sqrt(v). So all weights move about equally fast, whether
+    their gradients are large or small. Without it: the RMSprop of [Mnih15]. theta: the weights."""
     theta = list(theta)
     if not c.adam:
         return RMSprop(theta, c.lr)

@@ -95,8 +95,8 @@ class Scene:
     beacon_radius: float = 1.0  # m
     beacon_pixels: float = 3.0  # px, never drawn narrower than this
     camera: str = "grey"  # of CAMERAS: a grey level, or the disparity of a stereo camera
-    near: float = 2.0  # m, disparity is 255 from here on: the nearest ground stands 2.02 m away
-    sky: int = 90  # grey levels from here on
+    near: float = 2.0  # m, disparity is 255 at this depth; the nearest ground in view is at 2.02 m
+    sky: int = 90  # this and all below: grey levels
     ground: int = 60
     trunk_facing: int = 35  # bark seen head-on
     trunk_grazing: int = 0  # bark seen edge-on, darker, so that a trunk looks round
@@ -144,8 +144,8 @@ def fade(grey: ndarray, distance: ndarray, scene: Scene) -> ndarray:
 
 @cache
 def backdrop(scene: Scene) -> ndarray:
-    """Sky above the horizon, and ground that fades towards it, as one column (84, 1) uint8.
-    Or their disparity.
+    """What stands behind all trunks, as one column (84, 1) uint8: sky above the horizon, and below
+    it ground that fades towards the sky. The disparity camera sees how near both are.
 
     A row below the horizon, of slope -t, sees the ground at depth altitude / t.
     """

@@ -97,7 +97,7 @@ PILOTS = {  # name -> camera, weights
     "disparity": ("disparity", ROOT / "weights/disparity.pt"),
     "disparity, random noise": ("disparity", ROOT / "runs/looks-disparity/best.pt"),
 }
-CHANGES = {  # figure -> of `measure`, in flights of the random pilot?
+CHANGES = {  # figure -> its name in `measure`; is it counted in mean flights of random?
     "crossed": ("crossed", False), "crash": ("crash", False), "over_random": ("steps", True),
 }  # fmt: skip
 Trunks = Sequence[ndarray]
