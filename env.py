@@ -421,25 +421,6 @@ def measure(flights: Flights) -> dict[str, ndarray]:
     return table | {o: np.array([f["outcome"] == o for f in flights]) for o in OUTCOMES}
 
 
-def say(text: str, end: str = "\n", file: TextIO | None = None) -> None:
-    """Print, and work on if nobody reads: what goes to a closed pipe or terminal is lost."""
-    file = file or sys.stdout
-    try:
-        print(text, end=end, file=file, flush=True)
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
-        if file is not sys.stderr and error.errno not in (errno.EPIPE, errno.EIO):
-            error.filename = file.name
-            raise
-
-
-def show(text: str) -> None:
-    """Show a passing status on a terminal, over the last one; nothing when piped."""
-    if getattr(sys.stdout, "isatty", bool)() and os.environ.get("TERM") != "dumb":
-        room = min(shutil.get_terminal_size().columns, 999) - 1
-        say(f"{text[:room]:{room}}", "\r")
-
-
 # -------------------------------------------------- a planner: read it after dqn.py
 
 
@@ -513,7 +494,27 @@ def ways(world: World) -> tuple[ndarray, ndarray]:
     return np.cumsum(world.speed * world.dt * np.exp(1j * headings), 1), headings
 
 
-# -------------------------------------------------- legal worlds: skip this on a first reading
+# -------------------------------------------------- printing, legal worlds: skip on a first reading
+
+
+def say(text: str, end: str = "\n", file: TextIO | None = None) -> None:
+    """Print, and work on if nobody reads: what goes to a closed pipe or terminal is lost."""
+    file = file or sys.stdout
+    try:
+        print(text, end=end, file=file, flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
+        if file is not sys.stderr and error.errno not in (errno.EPIPE, errno.EIO):
+            error.filename = file.name
+            raise
+
+
+def show(text: str) -> None:
+    """Show a passing status on a terminal, over the last one; nothing when piped."""
+    if getattr(sys.stdout, "isatty", bool)() and os.environ.get("TERM") != "dumb":
+        room = min(shutil.get_terminal_size().columns, 999) - 1
+        say(f"{text[:room]:{room}}", "\r")
+
 
 # A world's numbers may go from 0.001 to 10,000; these have other limits. There are at most ten
 # actions, because a flight's record has one digit per action.
