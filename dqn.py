@@ -1,6 +1,62 @@
-"""dqn.py: all of DQN.
+"""dqn.py: all of DQN, the deep Q-network of [Mnih15]: network, replay, TD target, update, loop.
 
-HEADER
+An agent gets an observation s (four frames), takes an action a (one of nine yaw rates), and gets a
+reward r and the next observation s2. The **return** is the sum of all rewards to come, where one
+that is k steps away counts gamma^k times. gamma is the discount, 0.99, so soon is worth more than
+late. Three rewards 1, 1, -10 and then the end: 1 + 0.99 * 1 + 0.99^2 * -10 = -7.81.
+
+**Q(s, a)** is the return to expect after action a in s, if the best action follows ever after. An
+agent that knows Q can act: it takes the action of greatest Q. Here a neural network learns Q, a
+function with 1.7 million adjustable numbers, its weights: four frames go in, nine numbers come out.
+For each Q(s, a) it needs a target y to learn. Nobody has the true one. But the return from s is r
+plus gamma times the return from s2, so every transition (s, a, r, s2) makes a target of its own:
+
+    y = r + gamma * max over a2 of Q(s2, a2)        or y = r, if the world ended the episode
+
+In numbers: r = 0.5, and the greatest of the nine Q(s2, .) is 10. Then y = 0.5 + 0.99 * 10 = 10.4.
+If Q(s, a) is 8, its error is 2.4, and all weights are moved a little so that it grows. y is called
+the TD target (temporal difference), and the equation is Bellman's. A target that is made from
+another estimate bootstraps. That works because each target holds one true reward, and where a crash
+ends an episode the whole target is true. Take three steps with rewards 0.5, 0.5 and -10. Let there
+be one action only, let all Q be 0 at first, and let every update go all the way to its target:
+
+                     Q of step 1   step 2   step 3
+    after update 1       0.5         0.5     -10
+    after update 2       1.0        -9.4     -10     because 0.5 + 0.99 * -10 = -9.4
+    after update 3      -8.8        -9.4     -10     because 0.5 + 0.99 * -9.4 = -8.8: all are true
+
+The truth moves backwards. Three things can go wrong, and DQN has an answer to each:
+  * Steps that follow each other are alike (correlated samples), and a network that learns from them
+    in that order forgets the rest. So a **replay** keeps transitions, and each update draws some at
+    random. They were made by older, worse agents. That does no harm to y, which asks for the best
+    action in s2 and not for the one that was taken: Q-learning is off-policy.
+  * Each update of Q also moves the targets. So they come from a **target network** Q^, a copy of Q
+    that is synced only now and then.
+  * An agent that always does what seems best never finds what is better. So it **explores**: with
+    probability epsilon, at first 1 and later 0.05, its action is random (an exploration schedule).
+
+Algorithm 1 of [Mnih15]; `train` carries its numbers:
+
+     1  initialize replay memory D to capacity N
+     2  initialize action-value function Q with random weights theta
+     3  initialize target action-value function Q^ with weights theta- = theta
+     4  for episode = 1, M do
+     5      initialize sequence s_1 = {x_1} and preprocessed sequence phi_1 = phi(s_1)
+     6      for t = 1, T do
+     7          with probability epsilon select a random action a_t
+     8          otherwise select a_t = argmax_a Q(phi(s_t), a; theta)
+     9          execute action a_t in emulator and observe reward r_t and image x_{t+1}
+    10          set s_{t+1} = s_t, a_t, x_{t+1} and preprocess phi_{t+1} = phi(s_{t+1})
+    11          store transition (phi_t, a_t, r_t, phi_{t+1}) in D
+    12          sample random minibatch of transitions (phi_j, a_j, r_j, phi_{j+1}) from D
+    13          set y_j = r_j if the episode terminates at step j+1,
+                    r_j + gamma * max_a' Q^(phi_{j+1}, a'; theta-) otherwise
+    14          perform a gradient descent step on (y_j - Q(phi_j, a_j; theta))^2 w.r.t. theta
+    15          every C steps reset Q^ = Q
+
+Legend: A actions, B transitions in a batch, L environments side by side, T rows of the replay.
+[+name] marks what is not in the textbook; the setting of that name switches it off. (Two more are
+always on, because they only save time: Adam in place of Mnih's RMSprop, and bfloat16.)
 """
 
 import copy
@@ -15,9 +71,9 @@ from numpy.random import Generator
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-# How a transition ended: not at all, by the clock alone, or in the world itself (see env.py).
+# How a transition ended: not at all, by the time limit, or in the world itself (env.py tells more).
 LIVE, TRUNCATED, TERMINAL = range(3)
-# [+bfloat16] Convolutions are quicker in it where the processor has it natively.
+# Numbers of half as many bits make convolutions quicker, on processors that can reckon with them.
 BFLOAT16 = bool(torch.cpu.get_capabilities().get("avx512_bf16"))
 
 
@@ -26,7 +82,8 @@ class InputError(ValueError):
 
 
 def setting(default: Any, text: str, *legal: Any) -> Any:
-    """A field of a configuration: its default, what it is, and its least and greatest value."""
+    """A field of a configuration: its default, what it is, its least and greatest value (or, of a
+    word, all that it may be)."""
     return field(default=default, metadata={"help": text, "legal": legal})
 
 
@@ -63,16 +120,26 @@ class DQNConfig:
             raise InputError(f"replay_size and learning_starts must be {least} or more")
 
 
-class QNetwork(nn.Module):
-    """The network of [Mnih15, Methods].
+# -------------------------------------------------- the network
 
-    observation (4, 84, 84) -> conv 32 8x8/4 -> conv 64 4x4/2 -> conv 64 3x3/1 -> 512 -> Q(s, .) (A,)
+
+class QNetwork(nn.Module):
+    """The network of [Mnih15, Methods]: an observation goes in, Q(s, .) of all actions comes out.
+
+    It has layers, one after another. Each number that leaves a layer is a weighted sum of numbers
+    that enter it, plus a constant, its bias: with inputs 2 and -1, weights 3 and 4 and bias 1 it is
+    3 * 2 + 4 * -1 + 1 = 3. In a linear layer every output sees all inputs. In a convolution it sees
+    a small square, and all squares share the same few weights, called a filter. A filter of two
+    pixels with weights -1 and 1 makes 0 4 0 of the row 5 5 9 9: it finds the edge. Filters of 8x8
+    pixels that move on by 4 have (84 - 8) / 4 + 1 = 20 places in a row of 84. ReLU turns negative
+    numbers into 0; without it, two layers could do no more than one. The last layer has none,
+    because values may be negative.
     """
 
     def __init__(self, actions: int) -> None:
         super().__init__()
         self.conv = nn.Sequential(
-            *(nn.Conv2d(4, 32, 8, 4), nn.ReLU()),  # (B, 32, 20, 20)
+            *(nn.Conv2d(4, 32, 8, 4), nn.ReLU()),  # (B, 32, 20, 20): 32 filters, 8x8, move on by 4
             *(nn.Conv2d(32, 64, 4, 2), nn.ReLU()),  # (B, 64, 9, 9)
             *(nn.Conv2d(64, 64, 3, 1), nn.ReLU()),  # (B, 64, 7, 7)
             nn.Flatten(),  # (B, 3136)
@@ -80,10 +147,10 @@ class QNetwork(nn.Module):
         self.head = nn.Sequential(nn.Linear(3136, 512), nn.ReLU(), nn.Linear(512, actions))
 
     def forward(self, s: Tensor, bfloat16: bool = False) -> Tensor:
-        """Q(s, .) (B, A) float32 of s (B, 4, 84, 84) uint8.
+        """Q(s, .) (B, A) float32 of s (B, 4, 84, 84) uint8; PyTorch calls this for q(s).
 
-        [+bfloat16] The convolutions may use numbers of half as many bits. The last layers stay
-        float32, because values near 100 are common here, where bfloat16 has steps of 0.5.
+        Even with bfloat16 the last layers stay float32, because values near 100 are common here,
+        where bfloat16 has steps of 0.5 and actions would tie.
         """
         grey = s.to(torch.bfloat16 if bfloat16 else torch.float32).div_(255)  # (B, 4, 84, 84) 0..1
         with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
@@ -97,19 +164,43 @@ def greedy(q: QNetwork, s: ndarray) -> ndarray:
     return q(torch.from_numpy(s)).argmax(1).numpy()
 
 
+# -------------------------------------------------- the replay
+
+
 class Batch(NamedTuple):
     """B transitions drawn from the replay."""
 
     s: Tensor  # (B, 4, 84, 84) uint8
     a: Tensor  # (B,) int64
-    r: Tensor  # (B,) float32, the discounted sum of n rewards
-    s2: Tensor  # (B, 4, 84, 84) uint8, meaningless after TERMINAL
+    r: Tensor  # (B,) float32, the discounted sum of up to n_steps rewards
+    s2: Tensor  # (B, 4, 84, 84) uint8, the observation after them; meaningless after TERMINAL
     gamma_n: Tensor  # (B,) float32, gamma to the number of rewards in r
-    end: Tensor  # (B,) uint8
+    end: Tensor  # (B,) uint8, how the transition ended
 
 
 class Replay:
-    """The last transitions of `num_envs` environments side by side (line 1)."""
+    """The last transitions of L environments side by side (line 1).
+
+    Each frame is kept once, 7,056 bytes; s and s2 are put together when they are drawn. Keeping
+    both whole would cost eight times as much. Row t, environment l holds the newest frame of s_t,
+    the action taken there, its reward, and how it ended. The rows are a ring: after the last one
+    the first is written again.
+
+        rows ->         0 1 2 3 4 5 6 7 8 9 10
+        environment 0   x x x|x x x x x x x x     |: an episode's end
+        environment 1   x x x x x|x x x x x x     W: the row that is written next
+                                      W
+    Neither the four frames of an observation nor the n rewards of a target reach across an
+    episode's end, or across W. An example with one environment and n = 2:
+
+        row        0    1    2    3    4    5
+        frame      A    B    C    D    E    F
+        reward     1    1   -10   0    0    2      the episode of rows 0 to 2 ends in a crash
+
+        observation of row 3: D D D D, of row 5: D D E F
+        target of row 1: r = 1 + gamma * -10, and the episode ends there
+        target of row 3: r = 0 + gamma * 0, and s2 is the observation of row 5
+    """
 
     def __init__(self, capacity: int, num_envs: int) -> None:
         self.rows, self.num_envs = capacity // num_envs, num_envs  # T, L
@@ -124,7 +215,12 @@ class Replay:
         self, s: ndarray, a: ndarray, r: ndarray, s2: ndarray,
         terminated: ndarray, truncated: ndarray,
     ) -> None:  # fmt: skip
-        """Write one transition per environment (line 11): s, s2 (L, 4, 84, 84), all others (L,)."""
+        """Write one transition per environment: s, s2 (L, 4, 84, 84), all others (L,).
+
+        The next row holds the newest frame of s2. If the time limit ends an episode, the next row
+        begins another one, but the target still needs that frame, so `last_frames` keeps it. After
+        a crash no target needs it.
+        """
         row = self.added % self.rows
         self.frames[row], self.actions[row], self.rewards[row] = s[:, -1], a, r
         self.ends[row] = np.where(terminated, TERMINAL, np.where(truncated, TRUNCATED, LIVE))
@@ -135,10 +231,10 @@ class Replay:
         self.added += 1
 
     def sample(self, size: int, n: int, gamma: float, rng: Generator) -> Batch:
-        """Draw transitions uniformly (line 12).
+        """Draw transitions uniformly.
 
-        Not the oldest three rows, because the rows that complete their stacks are overwritten. Not
-        the newest n rows, because their rewards and s2 are yet to come.
+        The oldest three rows are left out, because the frames before them may be overwritten. The
+        newest n rows are left out, because their s2 is not there yet.
         """
         oldest = max(self.added - self.rows, 0) + 3
         row = rng.integers(oldest, self.added - n, size) % self.rows  # (B,)
@@ -146,26 +242,33 @@ class Replay:
         return self.window(row, env, n, gamma)
 
     def window(self, row: ndarray, env: ndarray, n: int, gamma: float) -> Batch:
-        """The transitions that start at row (B,), env (B,), each over n steps or to the episode's end."""
+        """The transitions from row (B,), env (B,), over n steps or to the end of the episode.
+
+        [+n_steps] With n = 2 the target of Q(s_0, a_0) is r_0 + gamma * r_1 + gamma^2 * (the
+        greatest Q^ of s_2): two true rewards, so the truth moves back by two steps in each update.
+        This has a price. r_1 followed from the action in s_1, which an older agent chose and which
+        may not have been the best one, so this target is not quite off-policy and rather too low.
+        """
         rows, envs = (row[:, None] + np.arange(n)) % self.rows, env[:, None]  # (B, n), (B, 1)
         live = self.ends[rows, envs] == LIVE  # (B, n)
-        reached = np.ones((len(row), n), np.float32)  # (B, n) 1 until the episode has ended, then 0
+        # Reward k counts if none of the steps 0 to k - 1 ended the episode: 1, otherwise 0.
+        reached = np.ones((len(row), n), np.float32)  # (B, n)
         reached[:, 1:] = np.cumprod(live[:, :-1], 1)
         discounts = np.float32(gamma) ** np.arange(n, dtype=np.float32)  # (n,)
         r = (reached * discounts * self.rewards[rows, envs]).sum(1)  # (B,)
         count = reached.sum(1).astype(int)  # (B,) rewards in r
-        last = (row + count - 1) % self.rows  # (B,)
+        last = (row + count - 1) % self.rows  # (B,) the row of the last one
         end = self.ends[last, env]  # (B,)
-        # s2 is the observation of the row after the last one, if the episode goes on there.
         s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), env)  # (B, 4, 84, 84)
-        for i in np.flatnonzero(end == TRUNCATED):
+        for i in np.flatnonzero(end == TRUNCATED):  # s2 is still that of the last row
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], env[i]]]
         s, a = self.stack(row, env), self.actions[row, env]  # (B, 4, 84, 84), (B,)
         gamma_n = np.float32(gamma) ** count.astype(np.float32)  # (B,)
         return Batch(*map(torch.from_numpy, (s, a, r, s2, gamma_n, end)))
 
     def stack(self, row: ndarray, env: ndarray) -> ndarray:
-        """The observations (B, 4, 84, 84) at row (B,), env (B,); an episode's first frame repeats."""
+        """The observations (B, 4, 84, 84) at row (B,), env (B,). Where an episode began less than
+        three rows before, its first frame repeats."""
         rows = [row]
         for _ in range(3):
             before = (rows[0] - 1) % self.rows  # (B,)
@@ -175,7 +278,11 @@ class Replay:
 
 
 def mirror(b: Batch, actions: int, rng: Generator) -> Batch:
-    """[+mirror] Reflect half of the transitions: frames left to right, a -> A - 1 - a."""
+    """[+mirror] Reflect half of the transitions: frames left to right, a -> A - 1 - a.
+
+    Flight, reward and camera are symmetric, so the reflection is one more true transition. Only the
+    forest's grid is not quite symmetric: it stands 0.5 m off centre.
+    """
     flip = rng.random(len(b.a)) < 0.5  # (B,)
     for frames in (b.s.numpy(), b.s2.numpy()):  # the same memory, seen as an array
         frames[flip] = frames[flip, ..., ::-1]
@@ -183,35 +290,68 @@ def mirror(b: Batch, actions: int, rng: Generator) -> Batch:
     return b
 
 
-def td_target(b: Batch, q2: Tensor, q2_online: Tensor) -> Tensor:
-    """The TD target y (B,) of line 13: r + gamma * max_a2 Q^(s2, a2), or r where the world ended."""
-    a2 = q2_online.argmax(1, keepdim=True)  # (B, 1)
-    v2 = q2.gather(1, a2)[:, 0]  # (B,) the q2 of a2; if q2_online is q2, the max
-    return b.r + b.gamma_n * torch.where(b.end == TERMINAL, 0.0, v2)
+# -------------------------------------------------- learning
 
 
 class Agent(nn.Module):
-    """What learning changes: Q, the target network Q^, the optimizer, and the mean of Q's weights."""
+    """What learning changes: Q, the target network Q^, the optimizer, the mean of Q's weights.
+
+    Adam keeps two running means for each weight: m of its gradient g, and v of g^2. A running mean
+    goes a small part of the way to each new number: m = 0.9 * m + 0.1 * g. The weight moves by
+    -lr * m / (sqrt(v) + eps), so all weights move about equally fast, except those with tiny
+    gradients. Rainbow's eps of 1.5e-4 belongs to errors of 1 at most [Hessel 2018]. Ours may be
+    ten times as large, and with them all gradients, so our eps is ten times as large too.
+    """
 
     def __init__(self, c: DQNConfig, actions: int, rng: Generator) -> None:
         super().__init__()
         with torch.random.fork_rng():  # torch draws the first weights from a generator of its own
             torch.manual_seed(int(rng.integers(2**63)))
-            self.q = QNetwork(actions).to(memory_format=torch.channels_last)  # 2
-        self.q_target = copy.deepcopy(self.q)  # 3
+            self.q = QNetwork(actions).to(memory_format=torch.channels_last)  # line 2
+        self.q_target = copy.deepcopy(self.q)  # line 3
         self.mean = AveragedModel(self.q)  # [+swa_fraction]
         eps = 1.5e-4 * c.huber_delta
         self.optimizer = torch.optim.Adam(self.q.parameters(), c.lr, eps=eps, fused=True)
         self.epsilon, self.loss = 1.0, 0.0
 
 
+def td_target(b: Batch, q2: Tensor, q2_online: Tensor) -> Tensor:
+    """The TD target y (B,): r + gamma_n * max_a2 Q^(s2, a2), or r where the episode terminated.
+
+    q2 (B, A): Q^(s2, .), which says what an action is worth. q2_online (B, A): the values by which
+    a2 is chosen. In the textbook both are the same, so the value of a2 is the maximum.
+
+    [+double] A maximum of noisy values is too high (overestimation bias). Let two actions both be
+    worth 0, and let Q^ err by +1 and -1: the maximum is 1. If Q chooses a2 instead, whose errors
+    differ from those of Q^, it hits +1 and -1 about equally often, which makes 0 on average.
+    """
+    a2 = q2_online.argmax(1, keepdim=True)  # (B, 1)
+    v2 = q2.gather(1, a2)[:, 0]  # (B,) q2[i, a2[i]] of each i
+    return b.r + b.gamma_n * torch.where(b.end == TERMINAL, 0.0, v2)
+
+
 def learn(agent: Agent, b: Batch, c: DQNConfig) -> None:
-    """Lines 13 and 14: move the weights once."""
+    """One update: lines 13 and 14.
+
+    The loss is one number that says how wrong a batch is, and its gradient says for each weight how
+    the loss changes if that weight grows. An example with one weight w = 2 and one input x = 4: Q
+    is w * x = 8, the target 10.4, and half the error's square 2.88. If w grew by a little d, Q
+    would grow by 4 d and the loss would fall by 2.4 * 4 d = 9.6 d: the gradient is -9.6. With a
+    learning rate of 0.01, w becomes 2 + 0.01 * 9.6 = 2.096, and Q 8.38.
+
+    PyTorch remembers how each tensor was made, so backward() can find the gradient of every weight,
+    and step() moves the weights. Under no_grad() it remembers nothing, so y is a constant.
+
+    [+huber_delta] The Huber loss is half the error's square up to delta and a straight line beyond,
+    so no error pulls harder than delta. Say that nine targets of ten are 0 and one is -10, a crash.
+    Q should be their mean, -1. With Mnih's delta of 1 it comes to rest where nine small pulls
+    balance one pull of 1: 9 * -Q = 1, so Q = -0.11, and the crash is nearly ignored.
+    """
     with torch.no_grad():
         q2 = agent.q_target(b.s2, BFLOAT16)  # (B, A)
         q2_online = agent.q(b.s2, BFLOAT16) if c.double else q2  # (B, A) [+double]
         y = td_target(b, q2, q2_online)  # 13 (B,)
-    q_sa = agent.q(b.s, BFLOAT16).gather(1, b.a[:, None])[:, 0]  # (B,)
+    q_sa = agent.q(b.s, BFLOAT16).gather(1, b.a[:, None])[:, 0]  # (B,) Q of the actions taken
     loss = nn.functional.huber_loss(q_sa, y, delta=c.huber_delta)  # 14 [+huber_delta]
     agent.optimizer.zero_grad()
     loss.backward()
@@ -229,34 +369,59 @@ def linear_schedule(step: int, first: float, final: float, steps: int) -> float:
 
 
 def due(every: int, step: int, num_envs: int) -> int:
-    """How often something is due in a pass of all environments that is due every so many steps.
+    """How many multiples of `every` lie among the control steps that a pass of all environments
+    has made. `step` is the last of them: 9 to 16 hold two multiples of 4, so two updates are due.
 
-    >>> due(4, 16, 8), due(2_000, 16, 8)  # this pass made steps 9 to 16: 12 and 16 are due
+    >>> due(4, 16, 8), due(2_000, 16, 8)
     (2, 0)
     """
     return step // every - (step - num_envs) // every
 
 
+# Textbook DQN for one environment, without what is marked [+]:
+#
+#     s = the first observation of an episode
+#     for each step:
+#         a = a random action with probability epsilon, else the a of greatest Q(s, a)
+#         s2, r, end = fly(a)
+#         put s, a, r, s2, end into the replay
+#         s = s2, or if the episode has ended the first observation of another one
+#         every 4 steps:
+#             b = 32 random transitions of the replay
+#             y = b.r if b.end is TERMINAL else b.r + gamma * max Q^(b.s2, .)
+#             loss = the mean of (y - Q(b.s, b.a))^2 / 2, straight lines beyond an error of 1
+#             move the weights of Q a little against the gradient of the loss
+#         every 2,000 steps:
+#             Q^ = Q
+
+
 def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator[tuple]:
-    """Algorithm 1 of [Mnih15]."""
+    """Algorithm 1, for L environments side by side, which share each pass through Q [+num_envs].
+
+    envs: a vector environment like env.VecForest. shaped: makes the rewards to learn from. This is
+    a generator: after each pass it yields agent and replay to deepflight.Run, which logs and saves.
+    It also yields once before the first step, so that Run can restore an interrupted training.
+    """
     replay = Replay(c.replay_size, c.num_envs)  # 1
     agent = Agent(c, envs.num_actions, rng)  # 2, 3
     yield agent, replay
+    # step: how many control steps there will have been after the pass
     for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):  # 4
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
         agent.optimizer.param_groups[0]["lr"] = lr
         s = envs.reset_done()  # 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
-        a = np.where(
-            explore, rng.integers(envs.num_actions, size=c.num_envs), greedy(agent.q, s)
-        )  # 8
+        random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
+        a = np.where(explore, random, greedy(agent.q, s))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
         replay.add(s, a, shaped(r, drones), s2, terminated, truncated)  # 11
-        for _ in range(due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0):
-            batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12
-            learn(agent, mirror(batch, envs.num_actions, rng) if c.mirror else batch, c)  # 13, 14
-            if step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction]
+        updates = due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0
+        for _ in range(updates):
+            batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
+            batch = mirror(batch, envs.num_actions, rng) if c.mirror else batch  # [+mirror]
+            learn(agent, batch, c)  # 13, 14
+            if step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction] a mean is steadier to fly
                 agent.mean.update_parameters(agent.q)
         if due(c.target_every, step, c.num_envs):
             agent.q_target.load_state_dict(agent.q.state_dict())  # 15

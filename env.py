@@ -24,29 +24,29 @@ a new frame from its camera. Each step earns a reward, which says how good the s
     r_safe = 0.25    r_crash = -10    r_goal = 1 - d_goal / d_max, 0 at the start and 1 at the goal
     r_near falls in a straight line from 0 at d_neg = 2.0 m to r_precrash = -5 at d_crash = 0.75 m
 
-One step in numbers: the drone is at x = 30 on the middle line, so d_goal = 60, and the nearest trunk
-is 1.5 m away. That is too close: -5 * (2.0 - 1.5) / (2.0 - 0.75) = -2. A third of the way is made:
-1 - 60 / 90 = 0.33. The reward of the step is -1.67.
+One step in numbers: the drone is at x = 30 on the middle line, so d_goal = 60, and the nearest
+trunk is 1.5 m away. That is too close: -5 * (2.0 - 1.5) / (2.0 - 0.75) = -2. A third of the way is
+made: 1 - 60 / 90 = 0.33. The reward of the step is -1.67.
 
-One flight from the start to its end is an episode. It is **terminated** when the world ends it: by a
-crash, at the goal, or outside the forest. No more reward can follow. It is **truncated** when only
-the clock ends it, after 1,000 steps: the drone was still flying, and more reward would have
+One flight from the start to its end is an **episode**. It is **terminated** when the world ends it:
+by a crash, at the goal, or outside the forest. No more reward can follow. It is **truncated** when
+only the clock ends it, after 1,000 steps: the drone was still flying, and more reward would have
 followed. A learner must keep the two apart, or it learns that late moments are bad.
 
-The drone sees its last four frames, an **observation**. That is less than the state of the world:
-the frames do not show which edge of the forest is the far one, or what stands behind the next trunk.
-The world is partially observed.
+The drone sees its last four frames, an **observation**. That is less than the whole state of the
+world: the frames do not show which edge of the forest is the far one, or what stands behind the
+next trunk. The world is partially observed.
 
-pymunk, a physics library, moves the drone and measures d_obs. An episode is a deterministic function
-of its seed and its actions, so these two are all it takes to fly it again, frame by frame.
+pymunk, a physics library, moves the drone and measures d_obs. An episode is a deterministic
+function of its seed and its actions, so these two are all it takes to fly it again.
 
 Legend
-    d_obs     m, from the drone's centre to the nearest trunk's surface, at most 20 m, a laser's range
+    d_obs     m, from the drone's centre to the nearest trunk's surface, at most a laser's range
     d_goal    m, from the drone's centre to the goal
     d_max     m, the forest's length
     psi       rad, the heading
     N         trunks
-    E         environments side by side that are active: their episodes have not ended
+    E         drones side by side whose episodes have not ended: the active ones
     [DF]      the Deep Flight paper; "authors' simulator" is the code released with it
     ours      a number that neither gives
 
@@ -66,7 +66,7 @@ from render import PIXELS, Scene, camera
 
 STACK = 4  # frames in an observation [DF §II-A]
 OUTCOMES = ("crash", "goal", "far", "back", "side", "time")  # how an episode may end
-Episode = dict[str, Any]  # what ForestEnv.episode returns
+Episode = dict[str, Any]  # what Drone.episode returns
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,9 @@ class World(Scene):
 def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
     """The reward of one step, [DF §II-A] line by line.
 
-    outcome: "" in the air, else as `ForestEnv.step` says. d_obs, d_goal: m. The paper prints the
-    inequality of r_near in reverse, and the authors' simulator computes r_goal and forgets to add
-    it. We follow the paper's text.
+    outcome: "" in the air, else one of OUTCOMES. d_obs, d_goal: m. The paper prints the
+    inequality of r_near in reverse, which we turn round. The authors' simulator computes r_goal
+    and forgets to add it; we add it, as the paper says.
 
     >>> reward("", 3.0, 45.0, World()), reward("", 0.75, 90.0, World())
     (0.75, -5.0)
@@ -132,7 +132,7 @@ def plant(seed: int, world: World) -> ndarray:
 
 
 class Drone:
-    """One drone in one forest, a new one every episode. What it does not do is look: see VecForest.
+    """A drone, and a new forest for it every episode. It does not see: VecForest draws its frames.
 
     An action is a whole number: 0 turns right at 0.7 rad/s, 4 flies straight, 8 turns left.
 
@@ -141,7 +141,7 @@ class Drone:
     """
 
     def __init__(self, world: World) -> None:
-        self.world, self.outcome = world, "not reset"
+        self.world, self.outcome = world, "not reset"  # counts as an episode that has ended
         self.space, self.body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         ground, trunks = self.space.static_body, world.rows * world.columns
         self.shapes = [pymunk.Circle(ground, world.trunk_radius) for _ in range(trunks)]
@@ -181,8 +181,8 @@ class Drone:
     def sense(self) -> None:
         """Measure where the drone is (pose: x, y in m and heading in rad), how much x it gained in
         this step (forward, m), its largest x so far (progress, m), d_obs and d_goal."""
-        x_before, self.pose = self.pose[0], (*self.body.position, self.body.angle)
-        x, y, _ = self.pose
+        (x, y), x_before = self.body.position, self.pose[0]
+        self.pose = (x, y, self.body.angle)
         self.forward, self.progress = x - x_before, max(self.progress, x)
         reach = self.world.laser_range
         trunk = self.space.point_query_nearest((x, y), reach, pymunk.ShapeFilter())
@@ -207,10 +207,11 @@ class Drone:
 class VecForest:
     """A vector environment: drones side by side, each in a forest of its own.
 
-    An observation is (4, 84, 84) uint8, oldest frame first; in the beginning the first frame stands
-    four times. One call of the camera draws for all drones, and one pass through a network can pick
-    all actions. seeds: the forests to fly through. Where none is left, a drone stays inactive after
-    its last episode. With `blind=True` all frames are black, for pilots that do not look.
+    An observation is (4, 84, 84) uint8, oldest frame first; at the start of an episode its first
+    frame is repeated four times. One call of the camera draws for all drones, and one pass through
+    a network can pick all actions. seeds: of the forests to fly through. When they run out, a drone
+    stays inactive after its last episode. With `blind=True` all frames are black, for pilots that
+    do not look.
     """
 
     def __init__(
@@ -282,7 +283,7 @@ def straight_pilot(s: ndarray, envs: VecForest) -> list[int]:
 
 
 def fly(pilot: Pilot, seeds: Sequence[int], world: World, *, blind: bool = False) -> list[Episode]:
-    """Fly one episode per seed, up to a hundred side by side; returns them in order of the seeds."""
+    """Fly one episode per seed, up to 100 side by side; returns them sorted by seed."""
     envs = VecForest(world, min(len(seeds), 100), seeds, blind=blind)
     while len(s := envs.reset_done()):  # (E, 4, 84, 84)
         envs.step(pilot(s, envs))

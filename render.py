@@ -19,21 +19,21 @@ Where does a ray meet a trunk?
                     . - .
                   /       \         along       from the camera to p, the ray's nearest point to
    camera ------ # --- p - |--->                the trunk's centre c
-                 |     |   |        across      from p to c, positive to the left (here negative)
+                 |     |   |        across      from p to c
                   \    c  /         half_chord  from the surface # to p
                     ' - '           radius      from the surface # to c
 
-    half_chord = sqrt(radius^2 - across^2)      by Pythagoras, if abs(across) < radius
+    half_chord = sqrt(radius^2 - across^2)      by Pythagoras, if across < radius
     distance   = along - half_chord             from the camera to the surface
-    cosine     = half_chord / radius            of the angle of incidence at #: 1 where the ray meets
-                                                the surface head-on, 0 where it only grazes it
+    cosine     = half_chord / radius            of the angle of incidence at #: 1 where the ray
+                                                meets the surface head-on, 0 where it grazes it
 
 One ray in numbers: a trunk of radius 0.5 m stands 10 m ahead and 0.3 m to the right. For the ray
-straight ahead, along = 10 and across = -0.3, so half_chord = 0.4 and the surface is 9.6 m away.
+straight ahead, along = 10 and across = 0.3, so half_chord = 0.4 and the surface is 9.6 m away.
 
 A pinhole camera has two rules:
-  * Column i looks along tan(bearing) = (41.5 - i) / 42, positive to the left. The columns are equally
-    spaced on the image plane, and not in angle.
+  * Column i looks along tan(bearing) = (41.5 - i) / 42, positive to the left. The columns are
+    equally spaced on the image plane, and not in angle.
   * A point h metres above the camera at depth z appears in row 41.5 - 42 * h / z. Depth is measured
     along the optical axis. With the distance along the ray instead, straight walls would look bent.
 The trunk above ends 4 m above the camera and begins 2 m below it, so at depth 9.6 it fills its
@@ -66,7 +66,7 @@ from PIL import Image, ImageDraw
 PIXELS = 84  # height and width of a frame [DF §II-A]
 CENTRE = (PIXELS - 1) / 2  # px: the optical axis meets the frame between its two middle pixels
 FOCAL = PIXELS / 2  # px: half the frame spans 45 degrees (ours)
-SLOPES = (CENTRE - np.arange(PIXELS)) / FOCAL  # (84,) how far left column i looks, and up row i
+SLOPES = (CENTRE - np.arange(PIXELS)) / FOCAL  # (84,) of column i to the left, of row i upwards
 BEARINGS = np.arctan(SLOPES)  # (84,) rad, counter-clockwise from straight ahead
 COSINES = np.cos(BEARINGS)  # (84,) depth for each metre along a ray
 ROWS = np.arange(PIXELS, dtype=np.uint8)[:, None]  # (84, 1)
@@ -99,8 +99,8 @@ def raycast(
 ) -> tuple[ndarray, ndarray]:  # fmt: skip
     """Find what each ray of each camera hits first. Cameras must stand outside all trunks.
 
-    centres (N, 2): the trunks, in m from the camera that sees them. radius: m, one, or (N,).
-    bearings (M,): rad, the same for all cameras. camera_of (N,): which camera sees the trunk.
+    The trunks of all cameras are in one list. centres (N, 2): m, from the camera that sees the
+    trunk. camera_of (N,): which camera that is. radius: m, one, or (N,). bearings (M,): rad.
     Returns the distance (E, M) in m along each ray, inf where it hits nothing, and the cosine
     (E, M) of the angle of incidence, 0 where it hits nothing.
 
@@ -129,9 +129,9 @@ def raycast(
 def shade(grey: ndarray | float, haze: ndarray | float, depth: ndarray, scene: Scene) -> ndarray:
     """The value of a pixel, 0 to 255. depth: m, of what it shows.
 
-    The grey camera mixes a grey level with the sky's, whose share grows through `haze` metres of
-    air, to 1 where the view ends. A stereo camera has two lenses side by side, which see a point in
-    columns that differ by focal length * baseline / depth: the disparity.
+    The grey camera mixes a grey level with the sky's: the more metres of haze, the more sky, and
+    nothing but sky where the view ends. A stereo camera has two lenses side by side, which see a
+    point in columns that differ by focal length * baseline / depth. That is the disparity.
 
     >>> shade(0, 0, np.array([1.0, 2.0, 4.0, np.inf]), Scene(camera="disparity"))
     array([255. , 255. , 127.5,   0. ])
@@ -160,8 +160,8 @@ def layer(
     depth = distance * COSINES  # (E, 84) m, along the optical axis
     value = shade(grey, haze, depth, scene).astype(np.uint8)  # (E, 84)
     above = np.array([height, 0.0])[:, None, None] - scene.altitude  # (2, 1, 1) m, top and foot
-    rows = np.clip(np.ceil(CENTRE - FOCAL * above / depth), 0, PIXELS)  # (2, E, 84), 42 at inf
-    top, foot = rows.astype(np.uint8)[:, :, None]  # (E, 1, 84) each
+    rows = np.clip(np.ceil(CENTRE - FOCAL * above / depth), 0, PIXELS)  # (2, E, 84)
+    top, foot = rows.astype(np.uint8)[:, :, None]  # (E, 1, 84) each; equal where depth is inf
     return (top <= ROWS) & (foot > ROWS), value[:, None]
 
 
@@ -178,8 +178,8 @@ def camera(
     ahead, left = seen.T  # (N,), (N,) m
     # Keep what may be in view: between the frame's edges at 45 degrees, with two radii to spare
     # because a trunk is wide.
-    near = (ahead > 0) & (ahead < scene.view) & (np.abs(left) < ahead + 2 * scene.trunk_radius)
-    visible = seen[near], scene.trunk_radius, BEARINGS, camera_of[near], len(poses)
+    in_view = (ahead > 0) & (ahead < scene.view) & (np.abs(left) < ahead + 2 * scene.trunk_radius)
+    visible = seen[in_view], scene.trunk_radius, BEARINGS, camera_of[in_view], len(poses)
     distance, cosine = raycast(*visible)  # (E, 84), (E, 84)
     grey = scene.trunk_grazing + (scene.trunk_facing - scene.trunk_grazing) * cosine  # (E, 84)
     mask, value = layer(distance, scene.trunk_height, grey, distance, scene)
@@ -218,8 +218,8 @@ def draw_panel(
     frame: ndarray, trunks: ndarray, path: ndarray, outcome: str,
     q: ndarray | None, action: int, text: str,
 ) -> Image.Image:  # fmt: skip
-    """One picture: the frame (84, 84), the path (T, 2) on a map of the trunks (N, 2), both in m, and
-    the values q (A,), if there are any, with the chosen action in red, left turns on the left."""
+    """One picture: the frame (84, 84), the path (T, 2) on a map of the trunks (N, 2), both in m,
+    and the values q (A,), if there are any, left turns on the left, the chosen action in red."""
     image = Image.new("RGB", (2 * PANEL[0], 2 * PANEL[1]), "white")
     draw = ImageDraw.Draw(image)
     draw.rectangle([464, 0, 1248, 464], fill="#f2f2ea")
@@ -233,6 +233,7 @@ def draw_panel(
     for a, value in enumerate(() if q is None else q):
         x, height = 8 + 50 * (len(q) - 1 - a), 120 * (value - q.min()) / max(np.ptp(q), 1e-9)
         draw.rectangle([x, 608 - height, x + 42, 612], fill=RED if a == action else GREY)
+    draw.text((8, 620), "" if q is None else "Q of each turn, left to right", GREY, font_size=26)
     draw.text((496, 476), text, fill="black", font_size=34, spacing=8)
     return image.resize(PANEL, Image.Resampling.BOX)
 

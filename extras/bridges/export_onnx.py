@@ -1,20 +1,20 @@
 """Export a trained network to ONNX, for where there is no torch: the paper's next step was a drone.
 
     extras/.venv/bin/pip install -r extras/requirements.txt
-    extras/.venv/bin/python -m extras.bridges.export_onnx      # weights/paper.pt -> runs/paper.onnx
+    extras/.venv/bin/python -m extras.bridges.export_onnx      # weights/dqn.pt -> runs/dqn.onnx
     extras/.venv/bin/python -m extras.bridges.export_onnx --camera disparity
 
 Input `observation` (B, 4, 84, 84) uint8, output `q` (B, 9) float32, any B; the action is the
-argmax. The script then flies forests from the first evaluation seed on, half of them at random, and
-holds the export against torch on 1,000 of the states met; last it times a single decision in both,
-on one thread. A control step lasts 100 ms. What it times is this machine's processor, not a Jetson.
+argmax. The script then flies validation forests, half of the drones at random, and holds the
+export against torch on 1,000 of the observations; last it times a single decision in both, on one
+thread. A control step lasts 100 ms. What it times is this machine's processor, not a Jetson.
 onnxruntime 1.17, which a Jetson has, reads opset 20 and IR version 9 at most. The export has less.
 
 What a stereo camera must deliver to the disparity pilot, ten times a second:
 
-    size     84x84 pixels of one byte; the four last pictures, the oldest first, 0.1 s apart
-    view     90 degrees wide and high: cut the middle square out of a wider picture. The lens looks
-             level and straight ahead, from 2 m above the ground, at 5 m/s: turn the picture back by
+    size     84x84 pixels of one byte; the four last frames, the oldest first, 0.1 s apart
+    view     90 degrees wide and high: cut the middle square out of a wider frame. The lens looks
+             level and straight ahead, from 2 m above the ground, at 5 m/s: turn the frame back by
              the drone's roll and pitch first
     value    510 / depth, cut at 255 and rounded down; depth in m along the lens's axis. A pair with
              focal length f px and baseline b m that measures d px has depth f * b / d. So write
@@ -31,6 +31,7 @@ import logging
 import time
 import warnings
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -38,12 +39,12 @@ import onnxruntime
 import torch
 from numpy import ndarray
 
-from deepflight import EVAL_FIRST
-from dqn import QNetwork, greedy, load_weights
-from env import ForestEnv, World
+from deepflight import VALIDATION, load_weights
+from dqn import QNetwork, greedy
+from env import VecForest, World
 from render import CAMERAS
 
-ROOT, STATES = Path(__file__).parents[2], 1000
+ROOT, SIZE = Path(__file__).parents[2], 1000
 WARMUP, CALLS = 50, 1000  # decisions before and in a timing
 
 
@@ -74,21 +75,18 @@ def session(path: Path) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
 
 
-def states(q: QNetwork, world: World, count: int) -> ndarray:
-    """States (count, 4, 84, 84) uint8 of flights by the network and by chance in turn."""
-    env, rng, seen, seed = ForestEnv(world), np.random.default_rng(0), [], EVAL_FIRST
-    while len(seen) < count:
-        s, _ = env.reset(seed=seed)
-        while not env.outcome:
-            seen.append(s)
-            a = rng.integers(world.actions) if seed % 2 else greedy(q, s[None])[0]
-            s = env.step(int(a))[0]
-        seed += 1
-    return np.stack(seen[:count])
+def observations(q: QNetwork, world: World, size: int) -> ndarray:
+    """What eight drones see (size, 4, 84, 84) uint8; half follow the network, half are random."""
+    envs, rng, seen = VecForest(world, 8, count(VALIDATION.start)), np.random.default_rng(0), []
+    while len(seen) < size:
+        s = envs.reset_done()  # (8, 4, 84, 84)
+        seen += [*s]
+        envs.step(np.where(np.arange(8) % 2, rng.integers(world.actions, size=8), greedy(q, s)))
+    return np.stack(seen[:size])
 
 
 def parity(q: QNetwork, run: onnxruntime.InferenceSession, s: ndarray) -> dict[str, float]:
-    """Largest difference over the largest value of its state, and the share of equal actions."""
+    """Largest difference over an observation's largest value, and the share of equal actions."""
     with torch.no_grad():
         ours = q(torch.from_numpy(s)).numpy()  # (N, 9)
     theirs = run.run(None, {"observation": s})[0]  # (N, 9)
@@ -112,18 +110,19 @@ def latency(decide: Callable[[ndarray], object], s: ndarray) -> dict[str, float]
 def main() -> None:
     """Export, compare, time."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--weights", type=Path, help="default: the shipped ones of this world")
-    parser.add_argument("--beacon", action="store_true", help="the world with the visible goal")
-    parser.add_argument("--camera", choices=CAMERAS, default="grey", help="what its pictures say")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--weights", type=Path, help="default: weights/dqn.pt")
+    which.add_argument("--beacon", action="store_true", help="the shipped ones that see a beacon")
+    which.add_argument("--camera", choices=CAMERAS, default="grey", help="what a pixel says")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    world = World(beacon=args.beacon, camera=args.camera)
-    name = "beacon" if args.beacon else "paper" if args.camera == "grey" else args.camera
-    weights = args.weights or ROOT / f"weights/{name}.pt"
-    q = load_weights(weights, World.actions, beacon=args.beacon, camera=args.camera)
+    shipped = "dqn-beacon" if args.beacon else "dqn"
+    shipped = "imitation-disparity" if args.camera == "disparity" else shipped
+    weights = args.weights or ROOT / f"weights/{shipped}.pt"
+    q, world, _ = load_weights(weights)
     path = Path("runs") / f"{weights.stem}.onnx"
     export(q, path)
-    run, s = session(path), states(q, world, STATES)
+    run, s = session(path), observations(q, world, SIZE)
     report = parity(q, run, s)
     report["onnxruntime, ms"] = latency(lambda one: run.run(None, {"observation": one}), s)
     report["torch, ms"] = latency(lambda one: greedy(q, one), s)

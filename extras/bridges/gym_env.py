@@ -1,30 +1,30 @@
 """The forest for Gymnasium: `DeepFlight/Forest-v0`. The paper's authors released one for Gym.
 
     extras/.venv/bin/pip install -r extras/requirements.txt
-    extras/.venv/bin/python -m extras.bridges.gym_env     # films a flight to runs/gym/
+    extras/.venv/bin/python -m extras.bridges.gym_env     # films an episode to runs/gym/
 
     import gymnasium, extras.bridges.gym_env                     # from the root of the repository
     env = gymnasium.make("DeepFlight/Forest-v0", render_mode="rgb_array", beacon=True)
     observation, info = env.reset(seed=3_000_000_000)
-    envs = gymnasium.make_vec("DeepFlight/Forest-v0", num_envs=8)    # a Fleet: one camera call
+    envs = gymnasium.make_vec("DeepFlight/Forest-v0", num_envs=8)    # one camera call for all
 
 Observation: Box(0, 255, (4, 84, 84), uint8), oldest frame first. Action: Discrete(9), 0 turns
 right, 8 left. Every field of env.World is a keyword argument. The world itself truncates after
-`max_steps`, and Gymnasium's time limit is 1,000 steps as well: for longer flights give
+`max_steps`, and Gymnasium's time limit is 1,000 steps as well: for longer episodes give
 `gymnasium.make` both `max_steps=2000` and `max_episode_steps=2000`.
 
 A seed is a forest. `reset(seed=k)` plants forest k, the same that `deepflight.py eval` flies as k.
 A reset without a seed draws one below 10^9, the range of training, from the environment's own
-generator. `info["forest"]` says which: keep it and the actions, and you can fly the flight again.
+generator. `info["forest"]` says which: keep it and the actions, and you can fly the episode again.
 
-With `forests="test"` every forest comes from [10^9, 2 * 10^9). A reset without a seed draws one
-there, and `reset(seed=k)` plants forest 10^9 + k % 10^9. So a test shares no forest with a training
+With `forests="validation"` every forest comes from [10^9, 2 * 10^9). A reset without a seed draws
+one there, and `reset(seed=k)` plants forest 10^9 + k % 10^9. So it shares no forest with a training
 whose seeds are below 10^9, even if both get the same seeds, as from Stable-Baselines3:
 
-    EvalCallback(Monitor(gymnasium.make("DeepFlight/Forest-v0", forests="test")))
+    EvalCallback(Monitor(gymnasium.make("DeepFlight/Forest-v0", forests="validation")))
 
-`make_vec` gives eight drones side by side. `reset(seed=k)` plants forests k, k + 1, and so on. The
-step after a flight's end begins the next flight in that lane, ignores its action, and pays 0.
+`make_vec` gives drones side by side. `reset(seed=k)` plants forests k, k + 1, and so on. The step
+after an episode's end begins the next one in that environment, ignores its action, and pays 0.
 """
 
 from collections.abc import Sequence
@@ -38,52 +38,69 @@ from gymnasium.vector.utils import batch_space
 from numpy import ndarray
 from PIL import Image
 
-from deepflight import EVAL_FIRST, TEST_FIRST, TRAIN_END
-from env import STACK, Fleet, ForestEnv, World, whole_number
-from render import PIXELS, draw_map, draw_ways
+from deepflight import TRAIN_END
+from env import STACK, Drone, VecForest, World
+from extras.experiments.maps import draw_map, draw_ways
+from render import PIXELS
 
 ID = "DeepFlight/Forest-v0"
 RENDER: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
-LIMIT = World.max_steps  # control steps, of gymnasium.make's own time limit
-RANGES = {"training": range(TRAIN_END), "test": range(TEST_FIRST, EVAL_FIRST)}  # of forests
+RANGES = {"training": range(TRAIN_END), "validation": range(TRAIN_END, 2 * TRAIN_END)}  # of forests
 AnyEnv = gymnasium.Env | VectorEnv
-Path = list[tuple[float, float]]  # m, from the start to where the drone is
 
 
-def dress(env: AnyEnv, render_mode: str | None, forests: str, world: World) -> None:
-    """Give an environment its metadata, its range of forests and the spaces of one drone."""
-    if render_mode not in (None, *RENDER["render_modes"]):
-        raise ValueError(f"render_mode is {render_mode!r}, allowed: None, 'rgb_array'")
-    if forests not in tuple(RANGES):
-        raise ValueError(f"forests is {forests!r}, allowed: 'training', 'test'")
-    env.render_mode, env.forests = render_mode, forests
+def dress(env: AnyEnv, world: World, num_envs: int, render_mode: str | None, forests: str) -> None:
+    """Give an environment its drones, its range of forests, and the spaces of one drone."""
+    for name, value, allowed in (
+        ("render_mode", render_mode, (None, "rgb_array")),
+        ("forests", forests, tuple(RANGES)),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{name} is {value!r}, allowed: {allowed}")
+    env.envs = VecForest(world, num_envs, ())  # it looks; we reset and step its drones
+    env.render_mode, env.numbers = render_mode, RANGES[forests]
     env.metadata = env.metadata | {"render_fps": max(1, round(1 / world.dt))}
     env.observation_space = Box(0, 255, (STACK, PIXELS, PIXELS), np.uint8)
     env.action_space = Discrete(world.actions)
 
 
-def choose(env: AnyEnv, seed: int | None) -> int:
-    """The number of the next forest: what the seed says, or drawn from the range if it is None."""
-    numbers = RANGES[env.forests]
+def begin(env: AnyEnv, drone: Drone, seed: int | None) -> None:
+    """Reset a drone in the forest that the seed names, or in one drawn from the range."""
+    first, last = env.numbers.start, env.numbers.stop
     if seed is None:
-        return int(env.np_random.integers(numbers.start, numbers.stop))
-    return seed if env.forests == "training" else numbers[seed % len(numbers)]
+        seed = int(env.np_random.integers(first, last))
+    drone.reset(int(seed) if first == 0 else env.numbers[seed % (last - first)])
 
 
-def picture(flyer: ForestEnv, path: Path) -> ndarray:
-    """What the drone sees beside the map with its way: (232, 624, 3) uint8 by default."""
-    chart = draw_map(flyer.trunks, (flyer.world.length, flyer.world.width))
-    chart = draw_ways(chart, [(np.array(path), flyer.edge or flyer.outcome, "")]).reduce(2)
-    frame = Image.fromarray(flyer.observation[-1]).convert("RGB")
+def look(envs: VecForest) -> ndarray:
+    """Give every drone its next frame, by one camera call; observations (E, 4, 84, 84)."""
+    for drone, frame in zip(envs.drones, envs.look(envs.drones), strict=True):
+        begun = not drone.actions
+        drone.path = [*([] if begun else drone.path), drone.pose[:2]]
+        drone.observation = np.stack([*([frame] * 3 if begun else drone.observation[1:]), frame])
+    return np.stack([drone.observation for drone in envs.drones])
+
+
+def info(drone: Drone) -> dict[str, Any]:
+    """Distances in m, the pose (x, y, heading), how the episode ended or "", and the forest."""
+    keys = "d_obs", "d_goal", "pose", "forward", "progress", "outcome"
+    return {key: getattr(drone, key) for key in keys} | {"forest": drone.seed}
+
+
+def picture(drone: Drone) -> ndarray:
+    """What the drone sees beside the map with its path: (232, 624, 3) uint8 by default."""
+    chart = draw_map(drone.trunks, (drone.world.length, drone.world.width))
+    chart = draw_ways(chart, [(np.array(drone.path), drone.outcome, "")]).reduce(2)
+    frame = Image.fromarray(drone.observation[-1]).convert("RGB")
     seen = frame.resize((chart.height, chart.height), Image.Resampling.NEAREST)
     return np.hstack([seen, chart])
 
 
 class Forest(gymnasium.Env):
-    """A ForestEnv in Gymnasium's clothes.
+    """One drone.
 
-    render_mode: None or "rgb_array". forests: "training" or "test", the range of its forests. The
-    rest are fields of env.World. Raises ValueError for any other value, and for a world that
+    render_mode: None or "rgb_array". forests: "training" or "validation", the range of its forests.
+    The rest are fields of env.World. Raises ValueError for any other value, and for a world that
     env.World refuses.
     """
 
@@ -92,47 +109,30 @@ class Forest(gymnasium.Env):
     def __init__(
         self, render_mode: str | None = None, *, forests: str = "training", **world: Any
     ) -> None:
-        self.flyer, self.path = ForestEnv(World(**world)), []
-        dress(self, render_mode, forests, self.flyer.world)
+        dress(self, World(**world), 1, render_mode, forests)
+        self.drone = self.envs.drones[0]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ndarray, dict[str, Any]]:
-        """Plant the forest of this seed, or one drawn from `np_random`; `options` is unused.
-
-        Returns the observation (4, 84, 84) uint8 and the info of ForestEnv, with the forest's
-        number. The head of this file says which forest a seed plants. Raises ValueError if the seed
-        is no whole number from 0. Then no flight is in the air.
-        """
-        if not self.flyer.outcome and len(self.flyer.actions) == LIMIT:
-            gymnasium.logger.warn(f"a flight was cut at step {LIMIT}: give max_episode_steps too")
-        self.path = []  # a reset that fails leaves no flight in the air
-        seed = seed if seed is None else whole_number("seed", seed)
+        """Plant the forest of this seed, or one drawn from `np_random`; `options` is unused."""
         super().reset(seed=seed)
-        observation, info = self.flyer.reset(seed=choose(self, seed))
-        self.path = [info["pose"][:2]]
-        return observation, info | {"forest": self.flyer.seed}
+        begin(self, self.drone, seed)
+        return look(self.envs)[0], info(self.drone)
 
     def step(self, action: int) -> tuple[ndarray, float, bool, bool, dict[str, Any]]:
-        """One control step, as ForestEnv.step; info has the number of the forest too.
-
-        Raises ResetNeeded before the first reset and after one that failed.
-        """
-        if not self.path:
-            raise gymnasium.error.ResetNeeded("call reset before step")
-        observation, reward, terminated, truncated, info = self.flyer.step(action)
-        self.path.append(info["pose"][:2])
-        return observation, reward, terminated, truncated, info | {"forest": self.flyer.seed}
+        """One control step. Raises ValueError if no episode is on, or there is no such action."""
+        r, outcome = self.drone.step(int(action)), self.drone.outcome
+        terminated, truncated = outcome not in ("", "time"), outcome == "time"
+        return look(self.envs)[0], r, terminated, truncated, info(self.drone)
 
     def render(self) -> ndarray | None:
-        """The picture, if there is a render mode. Raises ResetNeeded as step does."""
-        if not self.path:
-            raise gymnasium.error.ResetNeeded("call reset before render")
-        return picture(self.flyer, self.path) if self.render_mode else None
+        """The picture, if there is a render mode."""
+        return picture(self.drone) if self.render_mode else None
 
 
 class Forests(VectorEnv):
-    """A Fleet in Gymnasium's clothes. E drones; every step draws what all of them see at once.
+    """E drones side by side; one camera call draws what all of them see.
 
     The arguments are those of Forest. max_episode_steps is what gymnasium.make_vec passes on; it
     stands for max_steps, unless that is given.
@@ -141,18 +141,11 @@ class Forests(VectorEnv):
     metadata: ClassVar[dict[str, Any]] = RENDER | {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(
-        self,
-        num_envs: int = 1,
-        render_mode: str | None = None,
-        *,
-        forests: str = "training",
-        max_episode_steps: int = LIMIT,
-        **world: Any,
-    ) -> None:
-        self.num_envs = num_envs
-        self.fleet = Fleet(World(**{"max_steps": max_episode_steps} | world), num_envs)
-        self.paths: list[Path] = [[] for _ in range(num_envs)]
-        dress(self, render_mode, forests, self.fleet.world)
+        self, num_envs: int = 1, render_mode: str | None = None, *, forests: str = "training",
+        max_episode_steps: int = World.max_steps, **world: Any,
+    ) -> None:  # fmt: skip
+        self.num_envs, world = num_envs, {"max_steps": max_episode_steps} | world
+        dress(self, World(**world), num_envs, render_mode, forests)
         self.single_observation_space = self.observation_space
         self.single_action_space = self.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -167,76 +160,54 @@ class Forests(VectorEnv):
         """Plant the forests of `seed`, `seed` + 1, ..., or those of a list; `options` is unused.
 
         Where there is no seed, `np_random` draws one. The first seed given seeds `np_random`.
-        Raises ValueError if a seed is no whole number from 0, or a list has not one for each drone.
-        Then no flight is in the air.
         """
-        self.paths = [[] for _ in self.paths]  # a reset that fails leaves no flight in the air
-        if seed is None or np.ndim(seed) == 0:
-            first = seed if seed is None else whole_number("seed", seed)
-            seed = [first if first is None else first + lane for lane in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"seed has {len(seed)} numbers, allowed are {self.num_envs}")
-        seeds = [k if k is None else whole_number("seed", k) for k in seed]
-        super().reset(seed=next((k for k in seeds if k is not None), None))
-        self._begin(range(self.num_envs), seeds)
-        return self._observe()
+        if seed is None or isinstance(seed, int):
+            seed = [None if seed is None else seed + i for i in range(self.num_envs)]
+        super().reset(seed=next((k for k in seed if k is not None), None))
+        for drone, k in zip(self.envs.drones, seed, strict=True):
+            begin(self, drone, k)
+        return look(self.envs), self._infos()
 
     def step(self, actions: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray, dict[str, Any]]:
-        """One control step of the drones in the air; the landed ones begin their next flight.
+        """One control step of the active drones; the others begin their next episode.
 
         actions (E,). Returns observations (E, 4, 84, 84), rewards (E,), terminated (E,),
-        truncated (E,) and infos in Gymnasium's form for vectors. Raises ResetNeeded before the
-        first reset and after one that failed, and ValueError for actions of another shape or
-        outside the space; then no drone has moved.
+        truncated (E,) and infos in Gymnasium's form for vectors. Raises ValueError for actions of
+        another shape or outside the space; then no drone has moved.
         """
-        if not all(self.paths):
-            raise gymnasium.error.ResetNeeded("call reset before step")
-        if np.shape(actions) != (self.num_envs,):
-            raise ValueError(f"actions have shape {np.shape(actions)}, needed: ({self.num_envs},)")
-        landed, last = self.fleet.landed, self.fleet.world.actions - 1
-        flying = [lane for lane in range(self.num_envs) if lane not in landed]
-        turns = [whole_number("action", actions[lane], last) for lane in flying]
+        if actions not in self.action_space:
+            raise ValueError(f"actions are {actions}, allowed: {self.action_space}")
         rewards = np.zeros(self.num_envs)  # (E,)
-        if flying:
-            _, rewards[flying], *_ = self.fleet.step(turns)
-        for lane in flying:
-            self.paths[lane].append(self.fleet.envs[lane].pose[:2])
-        self._begin(landed, [None] * len(landed))
-        ends = [(env.terminated, env.truncated) for env in self.fleet.envs]
-        terminated, truncated = np.array(ends).T.copy()  # (E,), (E,)
-        observations, infos = self._observe()
-        return observations, rewards, terminated, truncated, infos
+        for i, drone in enumerate(self.envs.drones):
+            if drone.outcome:
+                begin(self, drone, None)
+            else:
+                rewards[i] = drone.step(int(actions[i]))
+        outcomes = np.array([drone.outcome for drone in self.envs.drones])  # (E,)
+        terminated, truncated = ~np.isin(outcomes, ("", "time")), outcomes == "time"  # (E,), (E,)
+        return look(self.envs), rewards, terminated, truncated, self._infos()
 
     def render(self) -> tuple[ndarray, ...] | None:
-        """The picture of each drone, if there is a render mode. Raises ResetNeeded as step does."""
-        if not all(self.paths):
-            raise gymnasium.error.ResetNeeded("call reset before render")
-        pairs = zip(self.fleet.envs, self.paths, strict=True)
-        return tuple(picture(*pair) for pair in pairs) if self.render_mode else None
+        """The picture of each drone, if there is a render mode."""
+        return tuple(picture(drone) for drone in self.envs.drones) if self.render_mode else None
 
-    def _begin(self, lanes: Sequence[int], seeds: Sequence[int | None]) -> None:
-        self.fleet.reset(lanes, [choose(self, seed) for seed in seeds])
-        for lane in lanes:
-            self.paths[lane] = [self.fleet.envs[lane].pose[:2]]
-            del self.fleet.records[lane][:-1]  # of flights that are over: nobody asks for them
-
-    def _observe(self) -> tuple[ndarray, dict[str, Any]]:
+    def _infos(self) -> dict[str, Any]:
         infos: dict[str, Any] = {}
-        for lane, env in enumerate(self.fleet.envs):
-            infos = self._add_info(infos, env.info() | {"forest": env.seed}, lane)
-        return np.stack([env.observation for env in self.fleet.envs]), infos  # (E, 4, 84, 84)
+        for i, drone in enumerate(self.envs.drones):
+            infos = self._add_info(infos, info(drone), i)
+        return infos
 
 
 gymnasium.register(
     id=ID,
     entry_point=f"{__name__}:Forest",
     vector_entry_point=f"{__name__}:Forests",
-    max_episode_steps=LIMIT,
+    max_episode_steps=World.max_steps,
 )
 
 
 def main() -> None:
-    """Film one flight of random actions."""
+    """Film one episode of random actions."""
     env = gymnasium.make(ID, render_mode="rgb_array")
     env = gymnasium.wrappers.RecordVideo(env, "runs/gym", name_prefix="random")
     env.reset(seed=0)

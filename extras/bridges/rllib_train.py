@@ -7,8 +7,7 @@
 
 The network is dqn.QNetwork itself, inside RLlib's current API stack: its convolutions are the
 encoder, its head the Q-function, so the trained weights are ours as they are. Settings are those
-of dqn.DQNConfig; RLlib has no mirroring, additions to the reward, averaged weights, bfloat16 or
-late Huber delta.
+of dqn.DQNConfig; RLlib has no mirroring, shaped reward, averaged weights, bfloat16 or wider loss.
 
 Runners share the flying, which is cheap. Learning stays in one process, a batch of 32 every 4 steps
 however many runners there are, and is the limit at once. What helps then is a GPU for the learner
@@ -26,16 +25,14 @@ on one, `ray start --address HOST:6379` on the others), with this Python and the
 and run the script on one of them; the code travels from here.
 """
 
-import argparse
 import logging
-import os
-import re
 import subprocess
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import ray
 from ray.exceptions import RayError
@@ -49,17 +46,23 @@ from ray.rllib.utils.schedules.scheduler import Scheduler
 from ray.tune.registry import register_env
 from torch import Tensor, nn
 
-from deepflight import WEIGHTS, Parser, RunConfig, place
-from dqn import DQNConfig, QNetwork, check_output, save_weights
+from deepflight import Config, Parser, save_weights
+from dqn import InputError, QNetwork
 from extras.bridges.gym_env import ID, Forest
 
 ROOT = Path(__file__).parents[2]
-ENVS = 4  # forests a runner flies at once
+ENVS = 4  # drones of a runner
 REPLAY = 50_000  # transitions, 28 kB each
-ADAM_EPSILON = 1.5e-4  # that of dqn.make_optimizer
+ADAM_EPSILON = 1.5e-4  # that of dqn.Agent at huber_delta 1
 PROBE = 0.05  # s to wait, before each batch, for a lost runner that may be back
-MOST_STEPS, MOST_RUNNERS = 10**9, 10_000
 ANSWER = 20  # s within which a Ray must answer
+
+
+@dataclass(frozen=True)
+class RLlibConfig(Config):
+    """Our settings, as far as RLlib knows them."""
+
+    pilot: ClassVar[str] = "rllib"
 
 
 class Nature(DefaultDQNTorchRLModule):
@@ -67,7 +70,7 @@ class Nature(DefaultDQNTorchRLModule):
 
     def setup(self) -> None:
         """Build the network, in place of the one that RLlib's catalog would."""
-        self.uses_dueling, self.uses_double_q, self.num_atoms = False, DQNConfig.double, 1
+        self.uses_dueling, self.uses_double_q, self.num_atoms = False, Config.double, 1
         self.epsilon_schedule = Scheduler(self.model_config["epsilon"], framework="torch")
         q = QNetwork(self.action_space.n)
         self.encoder, self.af = q.conv, q.head
@@ -84,8 +87,8 @@ def count(env_runner: Any, metrics_logger: Any, samples: Sequence[Any], **_: Any
     metrics_logger.log_value(key, sum(map(len, samples)), reduce="lifetime_sum")
 
 
-def make_config(c: DQNConfig, r: RunConfig, runners: int) -> RayConfig:
-    """RLlib's DQN with the settings of `c` and `r` as far as it knows them."""
+def make_config(c: Config, runners: int) -> RayConfig:
+    """RLlib's DQN with the settings of `c`."""
     replay = {"type": "EpisodeReplayBuffer", "capacity": REPLAY}
     epsilon = [[0, 1.0], [c.epsilon_decay, c.epsilon_final]]
     # RLlib counts one runner too many when it works out how often to learn.
@@ -95,7 +98,7 @@ def make_config(c: DQNConfig, r: RunConfig, runners: int) -> RayConfig:
         double_q=c.double, dueling=False, num_atoms=1, epsilon=epsilon,
         train_batch_size_per_learner=c.batch_size, training_intensity=intensity,
         num_steps_sampled_before_learning_starts=c.learning_starts, td_error_loss_fn="huber",
-        target_network_update_freq=c.target_every * c.update_every, adam_epsilon=ADAM_EPSILON,
+        target_network_update_freq=c.target_every, adam_epsilon=ADAM_EPSILON,
         replay_buffer_config=replay,
     )  # fmt: skip
     return (
@@ -109,7 +112,7 @@ def make_config(c: DQNConfig, r: RunConfig, runners: int) -> RayConfig:
         .fault_tolerance(restart_failed_env_runners=True, env_runner_health_probe_timeout_s=PROBE)
         .rl_module(rl_module_spec=RLModuleSpec(module_class=Nature))
         .training(**learning)
-        .debugging(seed=r.seed)
+        .debugging(seed=c.seed)
     )
 
 
@@ -122,10 +125,10 @@ def network(algorithm: Algorithm) -> QNetwork:
     return q
 
 
-def train(c: DQNConfig, r: RunConfig, runners: int, out: Path) -> None:
+def train(c: Config, runners: int, out: Path) -> None:
     """Train for c.steps, with a line each thousand steps or so, and write the weights."""
-    register_env(ID, lambda _context: Forest(beacon=r.beacon))
-    algorithm, steps = make_config(c, r, runners).build_algo(), 0
+    register_env(ID, lambda _context: Forest(beacon=c.beacon))
+    algorithm, steps = make_config(c, runners).build_algo(), 0
     nodes: dict[str, dict[str, float]] = {}  # steps of each runner on each node
     busy: Counter[str] = Counter()  # s in which each node flew
     while steps < c.steps:
@@ -138,12 +141,11 @@ def train(c: DQNConfig, r: RunConfig, runners: int, out: Path) -> None:
         left = max(c.steps - steps, 0) * seconds / steps / 60
         text = f"{steps:9,} steps, {steps / seconds:5.0f} a second, {left:5.1f} min left"
         text += f", {algorithm.env_runner_group.num_healthy_remote_env_runners()} runners"
-        print(f"{text}, flights of {flown.get('episode_len_mean', 0):.1f} steps", flush=True)
+        print(f"{text}, episodes of {flown.get('episode_len_mean', 0):.1f} steps", flush=True)
     report(nodes, busy, live)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    save_weights(out, network(algorithm), beacon=r.beacon, camera=r.camera)
+    save_weights(out, network(algorithm), c)
     algorithm.stop()
-    print(f"wrote {out}; fly it: deepflight.py eval{' --beacon' * r.beacon} --weights {out}")
+    print(f"wrote {out}; fly it: python deepflight.py eval --weights {out}")
 
 
 def report(nodes: dict[str, dict[str, float]], busy: Counter[str], live: list[str]) -> None:
@@ -173,41 +175,30 @@ def start(address: str | None, runners: int) -> None:
         knock(address)
     code = {"working_dir": str(ROOT), "excludes": [".venv", "runs", "results", "figures"]}
     quiet = {"include_dashboard": False, "log_to_driver": False, "logging_level": logging.ERROR}
-    cpus = None if address else runners  # a Ray that runs knows its own
-    ray.init(address=address or "local", num_cpus=cpus, runtime_env=code, **quiet)
-    if runners > (free := int(ray.available_resources().get("CPU", 0))):
-        raise ValueError(f"runners is {runners}, allowed here: 1 to {free}, one a free CPU")
-
-
-def parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Read and check the command line. Raises ValueError."""
-    parser = Parser(prog="rllib_train", description=__doc__.splitlines()[0])
-    parser.add_argument("--runners", type=int, default=2, help="processes that fly, one a CPU")
-    parser.add_argument("--steps", type=int, default=DQNConfig.steps, help="control steps in all")
-    parser.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
-    parser.add_argument("--address", help="of a running Ray; else one is started here")
-    parser.add_argument("--out", type=place, default="runs/rllib.pt", help="the weights' file")
-    args = parser.parse_args(argv)
-    if args.address is not None and not re.fullmatch(r"auto|[^/\s]+:\d{1,5}", args.address):
-        raise ValueError(f"address is {args.address!r}, allowed: auto or HOST:PORT")
-    most = MOST_RUNNERS if args.address else os.cpu_count()
-    for name, value, high in (("steps", args.steps, MOST_STEPS), ("runners", args.runners, most)):
-        if not 1 <= value <= high:
-            raise ValueError(f"{name} is {value}, allowed here: whole numbers from 1 to {high:,}")
-    check_output(args.out, WEIGHTS)
-    return args
+    ray.init(address=address or "local", runtime_env=code, **quiet)
+    free = int(ray.available_resources().get("CPU", 0))
+    if not 1 <= runners <= free:
+        raise InputError(f"runners is {runners}, allowed here: 1 to {free}, one a free CPU")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Check all that is given, join or start a Ray, and train. Exit codes: 2 bad input, 1 trouble
-    on the way, 130 Ctrl-C; each comes with one line."""
+    """Join or start a Ray, and train. Trouble comes with one line and exit code 2."""
+    parser = Parser(prog="rllib_train", description=__doc__.splitlines()[0])
+    parser.add_argument("--runners", type=int, default=2, help="processes that fly, one a CPU")
+    parser.add_argument("--steps", type=int, default=Config.steps, help="control steps in all")
+    parser.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
+    parser.add_argument("--address", help="of a running Ray; else one is started here")
+    parser.add_argument("--out", type=Path, default="runs/rllib.pt", help="the weights' file")
     try:
-        args = parse(argv)
+        args = parser.parse_args(argv)
+        c = RLlibConfig(steps=args.steps, beacon=args.beacon)
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.open("ab").close()  # better to fail now than after the training
         start(args.address, args.runners)
-        train(DQNConfig(steps=args.steps), RunConfig(beacon=args.beacon), args.runners, args.out)
-    except (ValueError, RuntimeError, FloatingPointError, OSError, RayError) as error:
-        print(f"rllib_train: error: {str(error).strip().splitlines()[-1]}", file=sys.stderr)
-        return 2 if isinstance(error, ValueError) else 1
+        train(c, args.runners, args.out)
+    except (InputError, RuntimeError, OSError, RayError) as error:
+        print(f"rllib_train: {str(error).strip().splitlines()[-1]}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("\ninterrupted; no weights are written", file=sys.stderr)
         return 130

@@ -3,36 +3,32 @@
     .venv/bin/python -m extras.cockpit              # then open the address that it prints
     .venv/bin/python -m extras.cockpit --port N     # at another port
 
-A web page on this machine, for this machine. It needs no package but the core's. flights.py has the
-answers, and index.html, cockpit.js and cockpit.css are the page.
+A web page on this machine, for this machine. It needs no package but the core's. episodes.py has
+the answers, and index.html, cockpit.js and cockpit.css are the page.
 
 Only the loopback listens. A request from another site's page is refused, because a browser says
 whose page asks (Origin), and to whom it believes to talk (Host). No text from the page becomes a
-path: weights are looked up by name in a list. Whatever is malformed gets 400 and one line.
+path: weights are looked up by name in a list.
 
 Not here: encryption, users, other machines. Do not put this server on a network.
 """
 
 import json
-import os
-import socket
 import sys
 import threading
-from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 HOST, PORT, LARGEST = "127.0.0.1", 8642, 2**14  # LARGEST: bytes of a request's body
-FOLDER, PAGE = Path(__file__).parent, {"index.html": "html", "cockpit.js": "javascript"}
-FILES = {f"/{name}": (FOLDER / name, f"text/{kind}") for name, kind in PAGE.items()}
-FILES |= {"/": FILES["/index.html"], "/cockpit.css": (FOLDER / "cockpit.css", "text/css")}
+PAGE = {"/": ("index.html", "text/html"), "/cockpit.js": ("cockpit.js", "text/javascript")}
+PAGE |= {"/cockpit.css": ("cockpit.css", "text/css")}
 HEADERS = {"X-Content-Type-Options": "nosniff", "Cache-Control": "no-store"}
 HEADERS["Content-Security-Policy"] = "default-src 'self'; img-src data:; frame-ancestors 'none'"
 
 
 class Server(ThreadingHTTPServer):
-    """Answers what a flights.Hangar can. Each connection has a thread, because browsers hold many
+    """Answers what an episodes.Hangar can. Each connection has a thread, because browsers hold many
     open, and the questions wait in line."""
 
     def __init__(self, port: int, hangar: Any) -> None:
@@ -44,15 +40,16 @@ class Server(ThreadingHTTPServer):
 
     def handle_error(self, *args: Any) -> None:
         """A connection that breaks concerns nobody else."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(*args)
 
 
 class Handler(BaseHTTPRequestHandler):
     """One connection."""
 
-    # Even a request that names no version gets a status line. Nagle's algorithm would keep the
-    # second half of an answer back for 40 ms. After 60 s without a word the connection closes.
-    protocol_version, default_request_version = "HTTP/1.1", "HTTP/1.0"
-    disable_nagle_algorithm, timeout = True, 60
+    # Nagle's algorithm would keep the second half of an answer back for 40 ms. After 60 s without a
+    # word the connection closes.
+    protocol_version, disable_nagle_algorithm, timeout = "HTTP/1.1", True, 60
 
     def parse_request(self) -> bool:
         """Read a request's head, and refuse what another site's page may have asked."""
@@ -66,20 +63,21 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Send a file of the page."""
-        file, kind = FILES.get(self.path, (None, ""))
-        self.answer(200, file.read_bytes(), kind) if file else self.answer(404, "no such page")
+        if self.path not in PAGE:
+            return self.answer(404, "no such page")
+        name, kind = PAGE[self.path]
+        self.answer(200, Path(__file__).with_name(name).read_bytes(), kind)
 
     def do_POST(self) -> None:
         """Answer a question."""
-        if not (answer := self.server.answers.get(self.path)):
-            return self.answer(404, "no such question")
         try:
-            if not 0 <= (length := int(self.headers["Content-Length"] or -1)) <= LARGEST:
-                raise ValueError(f"a request says its length, {LARGEST} bytes at most")
-            ask = json.loads(self.rfile.read(length))
+            length = int(self.headers["Content-Length"] or 0)
+            body = self.rfile.read(max(min(length, LARGEST), 0))
+            if not (answer := self.server.answers.get(self.path)):
+                return self.answer(404, "no such question")
             with self.server.lock:
-                content = json.dumps(answer(ask)).encode()
-        except (ValueError, OSError, RecursionError) as error:  # Recursion: lists in one another
+                content = json.dumps(answer(json.loads(body))).encode()
+        except ValueError as error:
             return self.answer(400, str(error))
         self.answer(200, content, "application/json")
 
@@ -95,50 +93,32 @@ class Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(content)
 
-    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """What http.server itself cannot read is a malformed request too."""
-        self.answer(400, message or "malformed request")
-
-    def finish(self) -> None:
-        """Hang up, but hear out what is still being sent, or the answer may not arrive."""
-        super().finish()
-        with suppress(OSError):
-            self.connection.settimeout(1)  # s
-            self.connection.recv(LARGEST, socket.MSG_WAITALL)
-
     def log_message(self, *args: Any) -> None:
         """Be silent: ten lines a second help nobody."""
-
-
-def listen(port: int, hangar: Any) -> Server:
-    """Take the port. Raises ValueError, which names the next free one, if that cannot be."""
-    for free in range(port if port >= 0 else 2**16, 2**16):
-        with suppress(OSError):
-            server = Server(free, hangar)
-            if free == port:
-                return server
-            raise ValueError(f"port {port} is taken: --port {free} is free")
-    raise ValueError(f"port is {port}, allowed are whole numbers below {2**16} of a free port")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Serve until Ctrl-C. Returns the exit code: 130, as a shell expects then; 2 for bad input."""
     try:  # the imports too, because torch takes seconds
         from deepflight import Parser
-        from extras.cockpit.flights import Hangar
+        from extras.cockpit.episodes import Hangar
 
         parser = Parser(prog="extras.cockpit", description="Fly a drone, and ask the network why.")
         parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"default: {PORT}")
-        server = listen(parser.parse_args(argv).port, Hangar())
+        port = parser.parse_args(argv).port
+        try:
+            server = Server(port, Hangar())
+        except (OSError, OverflowError) as error:
+            raise ValueError(f"port {port}: {error}; --port 0 takes any free one") from None
         print(f"the cockpit is at {server.ours[0]}/ (Ctrl-C ends it)", flush=True)
         server.serve_forever()
     except KeyboardInterrupt:
         print("\nthe cockpit is closed", file=sys.stderr)
     except (ValueError, OSError) as error:
-        print(f"extras.cockpit: error: {error}", file=sys.stderr)
+        print(f"extras.cockpit: {error}", file=sys.stderr)
         return 2
     return 130
 
 
 if __name__ == "__main__":
-    os._exit(main())  # at once, because a signal could hit Python's own slow end
+    sys.exit(main())

@@ -1,24 +1,31 @@
 "use strict";
 // The page of the cockpit. It shows what the server answers, and knows no rule of the world.
-// A flight has moments; each has pose, reward, return, d_obs, q, and a picture.
+// An episode has moments; each has pose, reward, return, d_obs, q, and a frame.
 
 const $ = (id) => document.getElementById(id);
 const PIXELS = 84;
-const MEANING = { beacon: "A pole stands at the goal, and can be seen.", disparity: "The pictures show how near things are." };
+const ENDS = {
+  crash: "crashed into a trunk", goal: "arrived at the goal", far: "crossed: left by the far edge",
+  side: "left by a side", back: "left by the back", time: "out of time",
+};
+const MEANING = { beacon: "A pole stands at the goal, and can be seen.", disparity: "The frames show how near things are." };
 let options; // what one may choose from, and the numbers of each world
 let chosen = {}; // world, weights, seed, pilot
-let flight = null; // the flight on show: choice, moments, record, actions, ended, trunks
+let episode = null; // the episode on show: choice, moments, record, actions, trunks
 let [ghost, plain] = [null, null]; // another one through the same forest, and its label; the one to go back to
 let t = 0; // the moment on show
 let [reasons, removed] = [null, null]; // the answer to "why" of moment t; what is taken out on show
 let [playing, busy] = [false, false]; // busy: a step is on its way
-let [generation, asked] = [0, 0]; // of flights, and of what was asked: what an older one waited for is dropped
-const landed = new Map(JSON.parse(sessionStorage.landed || "[]")); // flown by hand to their end, each once
+let [generation, asked] = [0, 0]; // of episodes, and of what was asked: what an older one waited for is dropped
+const done = new Map(JSON.parse(sessionStorage.done || "[]")); // flown by hand to their end, each once
 const stick = { held: {}, tapped: {}, side: 0, level: 0 };
 
 const world = () => options.worlds[chosen.world];
-const end = () => flight.moments.length - 1;
-const over = () => flight.ended !== "";
+const end = () => episode.moments.length - 1;
+const over = () => episode.record.outcome !== "";
+const ended = ({ record: { outcome } }) => ENDS[outcome];
+const isQ = () => world().weights[chosen.weights] === "dqn"; // an imitated network scores, and knows no return
+const score = () => (isQ() ? "Q" : "score");
 const byHand = () => chosen.pilot === "you";
 const steers = () => byHand() && t === end() && !over();
 const straight = () => (world().actions - 1) / 2;
@@ -27,10 +34,10 @@ const clock = (moment) => `${(moment * world().dt).toFixed(1)} s`;
 const signed = (x) => (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).replace(/^0/, "");
 const rate = (action) => signed(world().yaw_rate * (action / straight() - 1)); // rad/s
 const inWords = (a) => (a === straight() ? "flies straight on" : `turns ${a > straight() ? "left" : "right"} (${rate(a)} rad/s)`);
-const crossed = ({ record: { outcome, edge } }) => outcome === "goal" || edge === "far";
+const crossed = ({ record: { outcome } }) => outcome === "goal" || outcome === "far";
 const set = (node, values) => Object.entries(values).forEach(([key, x]) => node.setAttribute(key, x)) || node;
 const say = (text) => void ($("hint").textContent === text || ($("hint").textContent = text)); // read aloud once
-const writeAddress = () => history.replaceState(null, "", `#${new URLSearchParams({ ...flight.choice, t, actions: flight.actions })}`);
+const writeAddress = () => history.replaceState(null, "", `#${new URLSearchParams({ ...episode.choice, t, actions: episode.actions })}`);
 
 // -------------------------------------------------- the server
 async function post(path, content) {
@@ -59,14 +66,14 @@ async function attempt(action) {
   }
 }
 
-// -------------------------------------------------- flights
+// -------------------------------------------------- episodes
 async function begin(actions, moment) {
   const me = ++generation;
   pause();
   if (!/^[0-9]{1,18}$/.test(chosen.seed)) throw new Error("The forest is a whole number of at most 18 digits.");
   const found = await extend({ choice: chosen, moments: [] }, actions);
   if (me !== generation) return;
-  [flight, ghost, plain] = [found, null, null];
+  [episode, ghost, plain] = [found, null, null];
   drawForest();
   setReasons(null);
   show(Math.min(moment || 0, end()));
@@ -96,14 +103,14 @@ async function steer() {
   if (busy) return;
   busy = true;
   const [me, mine, start] = [generation, asked, performance.now()];
-  await extend(flight, flight.actions + turn()).finally(() => (busy = false));
+  await extend(episode, episode.actions + turn()).finally(() => (busy = false));
   if (me !== generation) return;
   show(end());
-  requestAnimationFrame(() => performance.measure("step to picture", { start }));
+  requestAnimationFrame(() => performance.measure("step to frame", { start }));
   if (mine === asked) help();
   if (!over()) return;
   pause();
-  say(`You: ${flight.ended}. R flies this forest again, N the next one. Or drag the time line, and ask why.`);
+  say(`You: ${ended(episode)}. R flies this forest again, N the next one. Or drag the time line, and ask why.`);
 }
 
 function turn() {
@@ -126,17 +133,17 @@ function hold(side, down) {
 // As it was until moment `from`, then another turn for some steps, then the network to the end.
 async function otherwise(from, action, steps) {
   const label = `what if ${rate(action)} at ${clock(from)}`;
-  const words = `The dashed way ${inWords(action)} at ${clock(from)} for ${clock(steps)}, then the network flies on`;
-  const other = { ...flight, from, label, words, whole: true, ended: "" };
-  [other.moments, other.actions] = [flight.moments.slice(0, from), flight.actions.slice(0, from)];
-  // The turn may end the flight, and no action can follow that.
-  for (let i = 0; i < steps && !other.ended; i++) await extend(other, other.actions + action);
+  const words = `The dashed path ${inWords(action)} at ${clock(from)} for ${clock(steps)}, then the network flies on`;
+  const other = { ...episode, from, label, words, whole: true, record: { outcome: "" } };
+  [other.moments, other.actions] = [episode.moments.slice(0, from), episode.actions.slice(0, from)];
+  // The turn may end the episode, and no action can follow that.
+  for (let i = 0; i < steps && !other.record.outcome; i++) await extend(other, other.actions + action);
   return extend(other, other.actions, world().max_steps);
 }
 
 async function whatIf(action) {
   pause();
-  if (t === end() && over()) return say("The flight ends here. Step back, and ask again.");
+  if (t === end() && over()) return say("The episode ends here. Step back, and ask again.");
   const me = asked;
   const other = await otherwise(t, action, Number($("hold").value));
   if (me !== asked) return;
@@ -146,7 +153,7 @@ async function whatIf(action) {
 function compare(other, known = "") {
   ghost = other;
   show(other.from);
-  say(`${known}${other.words}: ${other.ended}, total reward ${number(other.record.return)}. Esc, or the same bar, takes it away.`);
+  say(`${known}${other.words}: ${ended(other)}, total reward ${number(other.record.return)}. Esc, or the same bar, takes it away.`);
 }
 
 function clear() {
@@ -156,11 +163,11 @@ function clear() {
   draw();
 }
 
-// The last moment at which another turn saves the flight. It is flown, so the answer is exact.
+// The last moment at which another turn saves the episode. It is flown, so the answer is exact.
 async function wentWrong() {
   pause();
-  if (!over()) return say("This flight is not over. Fly it to its end first.");
-  if (crossed(flight)) return say(`Nothing went wrong: ${flight.ended}.`);
+  if (!over()) return say("This episode is not over. Fly it to its end first.");
+  if (crossed(episode)) return say(`Nothing went wrong: ${ended(episode)}.`);
   const [me, steps] = [asked, Math.round(0.5 / world().dt)];
   let from = end();
   while (from >= steps && from > end() - 10 * steps) {
@@ -172,22 +179,23 @@ async function wentWrong() {
       if (crossed(other)) return compare(other, `Of each half second, the last way out was at ${clock(from)}. `);
     }
   }
-  const best = flight.moments.map(({ q }) => Math.max(...q));
+  const nothing = `Nothing saves it: left, straight on and right for 0.5 s were tried at each half second from ${clock(from)} on.`;
+  if (!isQ()) return say(nothing);
+  const best = episode.moments.map(({ q }) => Math.max(...q));
   const falls = best.slice(1, -1).map((x, i) => best[i] - x);
   show(Math.max(falls.indexOf(Math.max(...falls)), 0));
-  say(`Nothing saves it: left, straight on and right for 0.5 s were tried at each half second from ${clock(from)} on.
-    After ${clock(t)} the greatest Q falls most. That counts only for weights learnt from rewards.`);
+  say(`${nothing} After ${clock(t)} the greatest Q falls most.`);
 }
 
 // -------------------------------------------------- why
 async function why(trunk = null) {
   pause();
   const [me, at] = [asked, t];
-  const answer = reasons || (await ask("/why", flight.choice, { actions: flight.actions, time: String(at) }));
+  const answer = reasons || (await ask("/why", episode.choice, { actions: episode.actions, time: String(at) }));
   if (me !== asked || at !== t) return;
   setReasons(answer, removed && removed.trunk === trunk ? null : trunk);
   draw();
-  if (trunk !== null && answer.without.every((x) => x.trunk !== trunk)) say("That is in none of the four pictures: without it nothing would change.");
+  if (trunk !== null && answer.without.every((x) => x.trunk !== trunk)) say("That is in none of the four frames: without it nothing would change.");
 }
 
 function setReasons(answer, trunk = null) {
@@ -197,7 +205,7 @@ function setReasons(answer, trunk = null) {
   $("turn").textContent = answer ? rate(answer.chosen) : "";
   $("things").replaceChildren();
   for (const x of things.slice(0, 8)) {
-    const name = x.trunk < 0 ? "the goal's pole" : `trunk ${whereabouts(flight.trunks[x.trunk])}`;
+    const name = x.trunk < 0 ? "the goal's pole" : `trunk ${whereabouts(episode.trunks[x.trunk])}`;
     const button = addButton($("things"), `${name} ${signed(x.weight)}`, () => attempt(() => why(x.trunk)));
     set(button, { class: x.weight > 0 ? "for" : "against", "aria-pressed": x === removed });
   }
@@ -205,14 +213,14 @@ function setReasons(answer, trunk = null) {
 }
 
 function whereabouts([x, y]) {
-  const [px, py, heading] = flight.moments[t].pose;
+  const [px, py, heading] = episode.moments[t].pose;
   const left = (y - py) * Math.cos(heading) - (x - px) * Math.sin(heading);
   return `${Math.hypot(x - px, y - py).toFixed(0)} m off, ${Math.abs(left).toFixed(1)} m ${left > 0 ? "left" : "right"}`;
 }
 
 function clickMap(event) {
   const place = new DOMPoint(event.clientX, event.clientY).matrixTransform($("map").getScreenCTM().inverse());
-  const things = flight.trunks.map((trunk, i) => [i, trunk]);
+  const things = episode.trunks.map((trunk, i) => [i, trunk]);
   if (world().beacon) things.push([-1, [world().length, 0]]);
   const far = things.map(([i, [x, y]]) => [Math.hypot(x - place.x, y + place.y), i]).sort((a, b) => a[0] - b[0]);
   if (far[0][0] < 2.5) attempt(() => why(far[0][1]));
@@ -225,7 +233,7 @@ const pause = () => setPlaying(false);
 function setPlaying(on) {
   [playing, asked] = [on, asked + 1];
   $("play").textContent = on ? "Pause" : "Play";
-  if (flight) help();
+  if (episode) help();
   if (on) attempt(loop);
 }
 
@@ -250,9 +258,9 @@ function stepTo(moment) {
 function show(moment) {
   if (moment !== t && reasons) setReasons(null);
   t = moment;
-  const { choice, record } = flight;
+  const { choice, record } = episode;
   const name = `${choice.world} ${record.seed} ${record.actions}`;
-  if (choice.pilot === "you" && over()) sessionStorage.landed = JSON.stringify([...landed.set(name, { world: choice.world, ...record })]);
+  if (choice.pilot === "you" && over()) sessionStorage.done = JSON.stringify([...done.set(name, { world: choice.world, ...record })]);
   draw();
 }
 
@@ -264,7 +272,7 @@ function drawForest() {
   set($("goal"), { cx: length });
   set($("pole"), { cx: length, r: beacon ? 0.7 : 0 });
   const circle = ([cx, y]) => set(document.createElementNS("http://www.w3.org/2000/svg", "circle"), { cx, cy: -y });
-  $("trunks").replaceChildren(...flight.trunks.map(circle));
+  $("trunks").replaceChildren(...episode.trunks.map(circle));
   for (let a = actions - 1; a >= 0 && $("bars").children.length < actions; a--) {
     const bar = addButton($("bars"), "", () => attempt(() => whatIf(a)));
     bar.innerHTML = `<span></span><span class="well"><i></i><i class="other"></i></span><span class="rate">${rate(a)}</span><span class="after"></span>`;
@@ -272,15 +280,15 @@ function drawForest() {
 }
 
 function draw() {
-  paint($("seen"), removed ? removed.frame : flight.moments[t].frame);
-  [...$("stack").children].forEach((canvas, i) => paint(canvas, flight.moments[Math.max(t - 3 + i, 0)].frame));
+  paint($("seen"), removed ? removed.frame : episode.moments[t].frame);
+  [...$("stack").children].forEach((canvas, i) => paint(canvas, episode.moments[Math.max(t - 3 + i, 0)].frame));
   [drawMap, drawBars, drawCurves, drawTable].forEach((part) => part());
   $("time").max = end();
   $("time").value = t;
   set($("time"), { "aria-valuetext": clock(t) });
   $("clock").textContent = `${clock(t)} of ${clock(end())}`;
-  const landing = t === end() && over() && `${flight.ended}, total reward ${number(flight.record.return)}`;
-  $("banner").textContent = removed ? `without ${removed.trunk < 0 ? "the goal's pole" : "this trunk"} (Esc puts it back)` : landing || "";
+  const banner = t === end() && over() && `${ended(episode)}, total reward ${number(episode.record.return)}`;
+  $("banner").textContent = removed ? `without ${removed.trunk < 0 ? "the goal's pole" : "this trunk"} (Esc puts it back)` : banner || "";
 }
 
 function paint(canvas, frame) {
@@ -291,16 +299,16 @@ function paint(canvas, frame) {
 }
 
 function drawMap() {
-  const way = (moments) => moments.map(({ pose: [x, y] }) => `${x.toFixed(2)},${(-y).toFixed(2)}`).join(" ");
+  const path = (moments) => moments.map(({ pose: [x, y] }) => `${x.toFixed(2)},${(-y).toFixed(2)}`).join(" ");
   const place = ([x, y, heading]) => `translate(${x} ${-y}) rotate(${(-heading * 180) / Math.PI})`;
   const edge = world().view * Math.tan(options.half_view);
-  for (const id of ["drone", "view"]) set($(id), { transform: place(flight.moments[t].pose) });
+  for (const id of ["drone", "view"]) set($(id), { transform: place(episode.moments[t].pose) });
   set($("view"), { d: `M0 0L${world().view} ${edge}V${-edge}Z` });
-  set($("whole-way"), { points: way(flight.moments) });
-  set($("way"), { points: way(flight.moments.slice(0, t + 1)) });
+  set($("whole-path"), { points: path(episode.moments) });
+  set($("path"), { points: path(episode.moments.slice(0, t + 1)) });
   // Who flies by hand should not see where the ghost is going to turn.
   const known = ghost ? ghost.moments.slice(0, byHand() && !over() && !ghost.whole ? t + 1 : undefined) : [];
-  set($("ghost-way"), { points: way(known) });
+  set($("ghost-path"), { points: path(known) });
   const at = ghost && ghost.moments[Math.min(t, ghost.moments.length - 1)].pose;
   set($("ghost"), { transform: at ? place(at) : "translate(-99 0)" });
   [$("main-name").textContent, $("ghost-name").textContent] = [chosen.pilot, ghost ? ghost.label : ""];
@@ -320,7 +328,7 @@ function drawTrunks() {
 }
 
 function drawBars() {
-  const [q, other] = [flight.moments[t].q, removed && removed.q];
+  const [q, other] = [episode.moments[t].q, removed && removed.q];
   const [low, high] = [Math.min(...q, ...(other || q)), Math.max(...q, ...(other || q))];
   const height = (x) => `${(100 * (x - low)) / Math.max(high - low, 1e-9)}%`;
   [...$("bars").children].forEach((bar, i) => {
@@ -329,29 +337,29 @@ function drawBars() {
     [value.textContent, after.textContent] = [number(q[a]), other ? number(other[a]) : ""];
     [before.style.height, without.style.height, without.hidden] = [height(q[a]), height(other ? other[a] : low), !other];
     bar.classList.toggle("best", q[a] === Math.max(...q));
-    bar.classList.toggle("flown", flight.actions[t] === String(a));
-    set(bar, { "aria-label": `${rate(a)} radians a second: Q ${number(q[a])}. What if it turned so?` });
+    bar.classList.toggle("flown", episode.actions[t] === String(a));
+    set(bar, { "aria-label": `${rate(a)} radians a second: ${score()} ${number(q[a])}. What if it turned so?` });
   });
 }
 
 function drawCurves() {
   const curve = ([key, name]) => {
-    const values = flight.moments.map((moment) => moment[key]);
+    const values = episode.moments.map((moment) => moment[key]);
     const [low, high] = [Math.min(0, ...values), Math.max(1, ...values)];
     const x = (moment) => ((100 * moment) / Math.max(end(), 1)).toFixed(2);
     const points = values.map((value, moment) => `${x(moment)} ${(30 - (30 * (value - low)) / (high - low)).toFixed(2)}`);
     return `<div class="curve"><span>${name} <b>${number(values[t])}</b></span><svg viewBox="0 0 100 30" preserveAspectRatio="none"
       aria-hidden="true"><path d="M${points.join("L")}"/><path d="M${x(t)} 0V30"/></svg></div>`;
   };
-  const curves = { reward: "reward", return: "total reward", d_obs: "nearest bark, m" };
+  const curves = { reward: "reward", return: "total reward", d_obs: "nearest trunk, m" };
   $("curves").innerHTML = Object.entries(curves).map(curve).join("");
 }
 
 function drawTable() {
-  const flights = [{ ...flight, label: chosen.pilot }, ghost].filter(Boolean);
-  const known = (f) => f.ended && (over() || f.whole);
-  const rows = { end: (f) => f.ended, steps: (f) => f.record.steps, "total reward": (f) => number(f.record.return) };
-  const line = (name, cell) => `<tr><th scope="row">${name}</th>${flights.map((f) => `<td>${cell(f)}</td>`).join("")}</tr>`;
+  const episodes = [{ ...episode, label: chosen.pilot }, ghost].filter(Boolean);
+  const known = (f) => ended(f) && (over() || f.whole);
+  const rows = { end: ended, steps: (f) => f.record.steps, "total reward": (f) => number(f.record.return) };
+  const line = (name, cell) => `<tr><th scope="row">${name}</th>${episodes.map((f) => `<td>${cell(f)}</td>`).join("")}</tr>`;
   const body = Object.entries(rows).map(([name, cell]) => line(name, (f) => (known(f) ? cell(f) : "…")));
   $("table").innerHTML = line("", (f) => `<b>${f.label}</b>`) + body.join("");
 }
@@ -366,10 +374,10 @@ function addButton(parent, text, action) {
 
 async function choose(change, actions = "", moment = null) {
   const after = (chosen = { ...chosen, ...change });
-  chosen.weights ||= world().weights[0];
+  chosen.weights ||= Object.keys(world().weights)[0];
   drawChoices();
   const well = await attempt(() => begin(actions, moment));
-  if (!well && flight && chosen === after) chosen = flight.choice;
+  if (!well && episode && chosen === after) chosen = episode.choice;
   drawChoices();
   return well;
 }
@@ -381,19 +389,21 @@ function drawChoices() {
     const add = (name) => addButton(row, name, () => choose(key === "world" ? { world: name, weights: "" } : { pilot: name }));
     if (!row.children.length) all.forEach((name) => set(add(name), { title: MEANING[name] || "" }));
     for (const button of row.children) set(button, { "aria-pressed": button.textContent === chosen[key] });
-    if (key === "world") all.forEach((name, i) => (row.children[i].disabled = !options.worlds[name].weights.length));
+    if (key === "world") all.forEach((name, i) => (row.children[i].disabled = !Object.keys(options.worlds[name].weights).length));
   }
-  $("weights").replaceChildren(...world().weights.map((name) => new Option(name, name, false, name === chosen.weights)));
+  $("weights").replaceChildren(...Object.keys(world().weights).map((name) => new Option(name, name, false, name === chosen.weights)));
   $("seed").value = chosen.seed;
   $("stick").hidden = !byHand();
+  [$("q").hidden, $("scores").hidden] = [!isQ(), isQ()];
+  document.querySelectorAll(".score").forEach((node) => (node.textContent = score()));
 }
 
 async function restore() {
   const told = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
   const first = { pilot: "you", world: Object.keys(options.worlds)[0], seed: told.seed || "1", weights: told.weights };
   if (options.pilots.includes(told.pilot)) first.pilot = told.pilot;
-  if (told.world in options.worlds && options.worlds[told.world].weights.length) first.world = told.world;
-  if (await choose(first, told.actions, Math.trunc(Math.abs(Number(told.t))) || 0) || flight) return;
+  if (told.world in options.worlds && Object.keys(options.worlds[told.world].weights).length) first.world = told.world;
+  if (await choose(first, told.actions, Math.trunc(Math.abs(Number(told.t))) || 0) || episode) return;
   const wrong = $("hint").textContent;
   if (await choose({ seed: "1", weights: "" })) say(wrong);
 }
@@ -402,23 +412,22 @@ async function share() {
   pause();
   writeAddress();
   const copied = await navigator.clipboard.writeText(location.href).then(() => " It is copied.", () => "");
-  say(`The address of this page holds this flight at this moment.${copied} It opens where a cockpit runs at ${location.host}.`);
+  say(`The address of this page holds this episode at this moment.${copied} It opens where a cockpit runs at ${location.host}.`);
 }
 
 function save() {
   pause();
-  const flights = [...landed.values()].filter((f) => f.world === chosen.world && f.seed < options.train_end);
-  const out = landed.size - flights.length;
-  const left = out ? ` Left out: ${out}, of another world, or of a forest from 1,000,000,000 up (those are for tests).` : "";
-  if (!flights.length) return say(`There is no flight to save. Fly by hand to an end, in a forest below 1,000,000,000.${left}`);
+  const episodes = [...done.values()].filter((f) => f.world === chosen.world && f.seed < options.train_end);
+  const out = done.size - episodes.length;
+  const left = out ? ` Left out: ${out}, of another world, or of a forest from 1,000,000,000 up (those are for validation and tests).` : "";
+  if (!episodes.length) return say(`There is no episode to save. Fly by hand to an end, in a forest below 1,000,000,000.${left}`);
   const { beacon, camera } = world();
-  const head = { program: "Deep Flight", weights: chosen.weights, beacon, camera, first_seed: flights[0].seed, forests: flights.length };
-  const pilots = { you: { flights: flights.map(({ world, ...record }) => record) } };
-  const file = new Blob([JSON.stringify({ ...head, pilots })], { type: "application/json" });
-  Object.assign(document.createElement("a"), { href: URL.createObjectURL(file), download: "flights.json" }).click();
+  const pilots = { you: { episodes: episodes.map(({ world, ...record }) => record) } };
+  const file = new Blob([JSON.stringify({ beacon, camera, pilots })], { type: "application/json" });
+  Object.assign(document.createElement("a"), { href: URL.createObjectURL(file), download: "episodes.json" }).click();
   const flags = (beacon ? " --beacon" : "") + (camera === "grey" ? "" : ` --camera ${camera}`);
-  say(`Flights in the file flights.json: ${flights.length}.${left}
-    To teach: .venv/bin/python deepflight.py train --demos FILE${flags}\n To compare: .venv/bin/python deepflight.py eval --pilots FILE dqn${flags}`);
+  say(`Episodes in the file episodes.json: ${episodes.length}.${left}
+    To learn from them: .venv/bin/python -m extras.lessons.expert demonstrations train --demos FILE --demo-pilot you${flags}`);
 }
 
 // -------------------------------------------------- keys and buttons
@@ -430,7 +439,7 @@ const actions = {
   again: () => choose({}),
   random: () => choose({ seed: String(Math.floor(Math.random() * options.train_end)) }),
   why: () => attempt(() => why()),
-  take: () => choose({ pilot: "you" }, flight.actions.slice(0, over() ? Math.min(t, end() - 1) : t), t),
+  take: () => choose({ pilot: "you" }, episode.actions.slice(0, over() ? Math.min(t, end() - 1) : t), t),
   wrong: () => attempt(wentWrong),
   clear, share, save,
 };
@@ -441,7 +450,7 @@ function key(event) {
   const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const own = event.target.matches("input, select") || (name === " " && event.target.matches("button"));
   const [side, action] = [SIDES[name], actions[KEYS[name]]];
-  if (own || event.ctrlKey || event.metaKey || event.altKey || !flight || !(side || action)) return;
+  if (own || event.ctrlKey || event.metaKey || event.altKey || !episode || !(side || action)) return;
   event.preventDefault();
   if (side && !event.repeat) hold(side, event.type === "keydown");
   if (action && event.type === "keydown") action();
@@ -459,7 +468,7 @@ function listen() {
     on(side, "pointerdown", () => hold(side, true));
     for (const name of ["pointerup", "pointerleave", "pointercancel"]) on(side, name, () => hold(side, false));
   }
-  for (const [name, action] of Object.entries(actions)) if ($(name)) on(name, "click", () => flight && action());
+  for (const [name, action] of Object.entries(actions)) if ($(name)) on(name, "click", () => episode && action());
   on("map", "click", clickMap);
   on("time", "input", () => stepTo(Number($("time").value)));
   on("seed", "change", () => choose({ seed: $("seed").value.trim() }));
@@ -472,5 +481,5 @@ attempt(async () => {
   listen();
   await restore();
   // Not at each change, because browsers complain if the address changes many times a second.
-  setInterval(() => flight && !playing && writeAddress(), 500);
+  setInterval(() => episode && !playing && writeAddress(), 500);
 });

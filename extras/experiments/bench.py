@@ -12,7 +12,7 @@
 (c) bytes that a transition takes in the replay, by its arrays;
 (d) growth: a step among 150, 1,500 and 15,000 trunks, equally dense, resets not counted, one core.
 
-A figure is the median of five rounds, a ratio the median of the rounds' ratios. Writes
+A number is the median of five rounds, a ratio the median of the rounds' ratios. Writes
 results/bench.json and prints the table of results/README.md. The runners are in peers.py.
 """
 
@@ -22,34 +22,23 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import count
 from pathlib import Path
 from statistics import median
 
 import numpy as np
 import torch
 
-from dqn import HAS_BFLOAT16, Replay
-from env import ForestEnv, World
+import dqn
+from env import VecForest, World
 from extras.bridges.sb3_train import make_model
-from extras.experiments.peers import (
-    DRONES,
-    PLAIN,
-    REPLAY,
-    RNG,
-    RUN,
-    doom,
-    forest,
-    forest_alone,
-    rooms,
-    sb3,
-    training,
-)
+from extras.experiments.peers import DRONES, PLAIN, REPLAY, RNG, doom, forest, ours, rooms, sb3
 
 ROOT, ROUNDS, SECONDS = Path(__file__).parents[2], 5, 4.0
 LONG = {"length": 900.0, "rows": 150}
 WIDE = LONG | {"width": 500.0, "columns": 100, "first_y": -247.0}
 FORESTS = {"150": {}, "1,500": LONG, "15,000": WIDE}  # trunks -> the world
-OURS = {"eight side by side": forest, "one alone": forest_alone}
+OURS = {"eight side by side": partial(forest, 8), "one alone": partial(forest, 1)}
 SCENES = {  # of the peers, the emptiest first
     "ViZDoom, my_way_home": partial(doom, "my_way_home"),
     "ViZDoom, deathmatch": partial(doom, "deathmatch"),
@@ -69,17 +58,16 @@ def rate(steps: Iterator[int]) -> float:
     return done / (time.perf_counter() - start)
 
 
-def flight_rate(env: ForestEnv) -> float:
-    """Steps a second, the resets not counted."""
-    done, spent = 0, 0.0
+def step_rate(envs: VecForest) -> float:
+    """Steps a second of one drone, the resets not counted."""
+    done, spent = envs.steps, 0.0
     while spent < SECONDS / 3:
-        env.reset()
+        envs.reset_done()
         start = time.perf_counter()
-        while not env.outcome:
-            env.step(int(RNG.integers(9)))
+        while envs.active:
+            envs.step([int(RNG.integers(9))])
         spent += time.perf_counter() - start
-        done += len(env.actions)
-    return done / spent
+    return (envs.steps - done) / spent
 
 
 def turns(jobs: Jobs) -> Given:
@@ -93,14 +81,14 @@ def turns(jobs: Jobs) -> Given:
 
 
 def ratio(given: Given, a: str, b: str) -> float:
-    """The median over the rounds of a's figure over b's."""
+    """The median over the rounds of a's rate over b's."""
     return median(x / y for x, y in zip(given[a], given[b], strict=True))
 
 
 def replay_bytes() -> dict[str, float]:
     """Of a transition, by the arrays of each replay."""
-    theirs = vars(make_model(PLAIN, RUN, 800).replay_buffer).values()
-    replays = {"ours": (REPLAY, vars(Replay(REPLAY, DRONES)).values()), "sb3": (800, theirs)}
+    theirs = vars(make_model(PLAIN, 800).replay_buffer).values()
+    replays = {"ours": (REPLAY, vars(dqn.Replay(REPLAY, DRONES)).values()), "sb3": (800, theirs)}
     return {
         name: sum(x.nbytes for x in arrays if isinstance(x, np.ndarray)) / size
         for name, (size, arrays) in replays.items()
@@ -112,41 +100,40 @@ def on_one_core() -> tuple[Given, Given]:
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})
     a = turns({name: partial(rate, runner()) for name, runner in (OURS | SCENES).items()})
-    worlds = {f"{n} trunks": ForestEnv(World(**world)) for n, world in FORESTS.items()}
-    d = turns({name: partial(flight_rate, env) for name, env in worlds.items()})
+    worlds = {f"{n} trunks": VecForest(World(**world), 1, count()) for n, world in FORESTS.items()}
+    d = turns({name: partial(step_rate, envs) for name, envs in worlds.items()})
     os.sched_setaffinity(0, cores)
     return a, d
 
 
 def main() -> None:
     """Run it all, write it, print it."""
-    torch.set_num_threads(RUN.threads)
-    torch.set_flush_denormal(True)  # as our training does, for Stable-Baselines3 too
+    bfloat16 = dqn.BFLOAT16
     (a, d), step, train = on_one_core(), "time of a step:", "training steps a second: ours"
-    ours = {f"ours, bfloat16 {x}": partial(training, x) for x in sorted({False, HAS_BFLOAT16})}
-    b, c = turns({"sb3": partial(rate, sb3()), **ours}), replay_bytes()
-    figures = {
+    runners = {"sb3": sb3(), "ours": ours(False)} | ({"bfloat16": ours(True)} if bfloat16 else {})
+    torch.set_num_threads(PLAIN.threads)
+    torch.set_flush_denormal(True)  # as our training does, for Stable-Baselines3 too
+    b, c = turns({name: partial(rate, x) for name, x in runners.items()}), replay_bytes()
+    ratios = {
         f"environment steps a second: ours, {way} / {x}": ratio(a, way, x)
         for way in OURS
         for x in SCENES
     }
-    figures[f"{train} / Stable-Baselines3's, float32 both"] = ratio(
-        b, "ours, bfloat16 False", "sb3"
-    )
-    if HAS_BFLOAT16:
-        other = ratio(b, "ours, bfloat16 True", "sb3")
-        figures[f"{train} in bfloat16 / Stable-Baselines3's"] = other
-    figures |= {
+    ratios[f"{train} / Stable-Baselines3's, float32 both"] = ratio(b, "ours", "sb3")
+    if bfloat16:
+        other = ratio(b, "bfloat16", "sb3")
+        ratios[f"{train} in bfloat16 / Stable-Baselines3's"] = other
+    ratios |= {
         "replay bytes a transition: Stable-Baselines3's default / ours": c["sb3"] / c["ours"],
         f"{step} 1,500 / 150 trunks": ratio(d, "150 trunks", "1,500 trunks"),
         f"{step} 15,000 / 150 trunks": ratio(d, "150 trunks", "15,000 trunks"),
     }
     rates = {name: median(x) for part in (a, b, d) for name, x in part.items()}
     cpu = re.search("model name.*: (.*)", Path("/proc/cpuinfo").read_text())[1]
-    report = {"machine": cpu, "torch": torch.__version__, "threads": RUN.threads}
-    report |= {"figures": figures, "rates": rates, "bytes": c}
+    report = {"machine": cpu, "torch": torch.__version__, "threads": PLAIN.threads}
+    report |= {"ratios": ratios, "rates": rates, "bytes": c}
     (ROOT / "results/bench.json").write_text(json.dumps(report, indent=1) + "\n")
-    print("\n".join(f"| {name} | {figure:.2f} |" for name, figure in figures.items()))
+    print("\n".join(f"| {name} | {value:.2f} |" for name, value in ratios.items()))
 
 
 if __name__ == "__main__":

@@ -1,87 +1,62 @@
-"""How soon does a training pass the paper's +180 %, and how soon does a taught one cross?
+"""How soon does a training from rewards pass the paper's +180 %, and how soon does imitation cross?
 
-    .venv/bin/python -m extras.experiments.clock    # leave the machine alone: half an hour
+    .venv/bin/python -m extras.experiments.clock    # leave the machine alone: ten minutes
 
-Trains seeds in turn, and takes the time from the command to the line of each of the first test
-points, imports and tests included. The test forests choose what best.pt keeps, so they cannot say
-how good it is. The weights of each test point then fly through 200 forests that no training, test
-or evaluation uses. The first to pass the bar there counts. Writes results/clock.json. A question
-that has its answer there is not asked again.
+Trains seeds in turn. After every 5,000 control steps the clock stands still, and the newest weights
+fly through 200 forests that no training and no validation uses. The first to pass the bar there
+count. Writes results/clock.json. A question that has its answer there is not asked again.
 """
 
 import json
-import shutil
-import signal
-import subprocess
-import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from statistics import median
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
 
-from deepflight import dqn_pilot, summarize
-from dqn import load_weights
-from env import World, fly, fly_random
+import dqn
+from deepflight import Config, Run, dqn_pilot, fly_random, summarize
+from env import World, fly
+from extras.lessons import expert
 
 ROOT = Path(__file__).parents[2]
 RESULT = ROOT / "results/clock.json"
-FORESTS = range(5 * 10**9, 5 * 10**9 + 200)
+FORESTS, EVERY = range(5 * 10**9, 5 * 10**9 + 200), 5_000  # control steps
 
 
 class Question(NamedTuple):
     """When does a training pass a bar?"""
 
-    flags: list[str]
-    figure: str
+    config: type[Config]
+    train: Callable
+    metric: str
     bar: float
-    every: int  # steps between test points
-    points: int  # how many of them to train to
     seeds: int  # seeds 0, 1, ...
 
 
 QUESTIONS = {
-    "from rewards": Question([], "over_random", 1.8, 5_000, 3, 5),
-    "taught": Question(["--teacher"], "crossed", 0.5, 5_000, 10, 3),
+    "from rewards": Question(Config, dqn.train, "longer", 1.8, 5),
+    "imitation": Question(expert.ExpertConfig, expert.train, "crossed", 0.5, 3),
 }
 
 
-def train(asked: Question, seed: int, folder: Path) -> list[float]:
-    """Train to the last of the test points: the seconds of each. Keeps 0.pt, 1.pt, ..."""
-    words = ["train", "--name", "clock", "--seed", str(seed), "--test-every", str(asked.every)]
-    line, seconds = [sys.executable, str(ROOT / "deepflight.py"), *words, *asked.flags], []
-    start = time.perf_counter()
-    with subprocess.Popen(line, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
-        while len(seconds) < asked.points:
-            next(row for row in process.stdout if "%" in row)  # one row a test point
-            seconds.append(time.perf_counter() - start)
-            shutil.copy(folder / "runs/clock/best.pt", folder / f"{len(seconds) - 1}.pt")
-        process.send_signal(signal.SIGTERM)
-        process.stdout.read()
-    return seconds
-
-
-def flown(path: Path, figure: str) -> float:
-    """What these weights reach in forests that chose nothing."""
-    rng, world = np.random.default_rng(0), World()
-    q = load_weights(path, World.actions, beacon=False, camera="grey")
-    bar = fly_random(FORESTS, world, rng)
-    draws = rng.integers(len(FORESTS), size=(1, len(FORESTS)))
-    return summarize(fly(dqn_pilot(q), FORESTS, world), bar, draws)[figure]["value"]
-
-
 def answer(asked: Question, seed: int) -> dict[str, float]:
-    """The step and the seconds of the first test point that passes; ValueError if none does."""
-    with TemporaryDirectory() as folder:
-        seconds = train(asked, seed, Path(folder))
-        for point, passed in enumerate(seconds):
-            if (found := flown(Path(folder) / f"{point}.pt", asked.figure)) > asked.bar:
-                step = (point + 1) * asked.every
-                print(f"seed {seed}: {found:.0%} at step {step:,}, {passed:.1f} s", flush=True)
-                return {"step": step, "seconds": passed, asked.figure: found}
-    raise ValueError(f"seed {seed} does not pass within {asked.points} test points")
+    """The step and the seconds of the first weights that pass; ValueError if none do."""
+    baseline, draws = fly_random(FORESTS, World()), np.arange(len(FORESTS))[None]
+    run = Run(asked.train, asked.config(seed=seed), Path())  # it writes nothing there
+    seconds, start = 0.0, time.perf_counter()
+    for _ in run.loop:
+        if dqn.due(EVERY, step := run.envs.steps, run.c.num_envs):
+            seconds += time.perf_counter() - start
+            episodes = fly(dqn_pilot(run.agent.q), FORESTS, World())
+            found = summarize(episodes, baseline, draws)[asked.metric]["value"]
+            print(f"seed {seed}: {found:.0%} at step {step:,}, {seconds:.1f} s", flush=True)
+            if found > asked.bar:
+                return {"step": step, "seconds": seconds, asked.metric: found}
+            start = time.perf_counter()
+    raise ValueError(f"seed {seed} does not pass within {run.c.steps:,} steps")
 
 
 def main() -> None:

@@ -3,9 +3,9 @@
     extras/.venv/bin/python -m extras.experiments.cockpit_pictures
 
 Needs Debian's packages chromium and chromium-driver; the page itself does not. The three moments:
-a flight by hand has ended beside the network's; why the network would have turned, without one
+an episode by hand has ended beside the network's; why the network would have turned, without one
 trunk; what if it had turned the other way. Then prints the milliseconds from a step's begin to its
-picture, and from the question why to the answer. Takes half a minute.
+frame, and from the question why to the answer. Takes half a minute.
 """
 
 import tempfile
@@ -25,7 +25,7 @@ from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.support.ui import WebDriverWait
 
 from extras.cockpit.__main__ import Server
-from extras.cockpit.flights import ROOT, Hangar
+from extras.cockpit.episodes import ROOT, Hangar
 
 HAND = "54444444432100" + 63 * "4"  # a tap to the left, then the right key held; it crashes
 CHROMIUM, DRIVER = Path("/usr/bin/chromium"), Path("/usr/bin/chromedriver")
@@ -74,12 +74,12 @@ def until(browser: webdriver.Chrome, script: str) -> Any:
     return soon.until(lambda _: value(browser, script))
 
 
-def visit(browser: webdriver.Chrome, host: str, **flight: object) -> None:
-    """Open the page at a flight, as its address says, and wait until it and the ghost are there."""
-    after = "&".join(f"{key}={x}" for key, x in flight.items())
+def visit(browser: webdriver.Chrome, host: str, **episode: object) -> None:
+    """Open the page at an episode, as its address says; wait until it and the ghost are there."""
+    after = "&".join(f"{key}={x}" for key, x in episode.items())
     browser.get("about:blank")
     browser.get(f"http://{host}/#{after}")
-    until(browser, "flight && (byHand() || over()) && (ghost || chosen.pilot === 'network')")
+    until(browser, "episode && (byHand() || over()) && (ghost || chosen.pilot === 'network')")
 
 
 def moments(browser: webdriver.Chrome, host: str) -> Iterator[bytes]:
@@ -101,7 +101,7 @@ def moments(browser: webdriver.Chrome, host: str) -> Iterator[bytes]:
 def latencies(browser: webdriver.Chrome, host: str) -> dict[str, list[float]]:
     """Milliseconds of every step while the network's ghost flies along, and of ten questions."""
     visit(browser, host, seed=42)
-    script = "performance.getEntriesByName('step to picture').map((entry) => entry.duration)"
+    script = "performance.getEntriesByName('step to frame').map((entry) => entry.duration)"
     for _ in range(4):
         ActionChains(browser).send_keys(Keys.SPACE).perform()
         until(browser, "over()")
@@ -118,7 +118,7 @@ def latencies(browser: webdriver.Chrome, host: str) -> dict[str, list[float]]:
           }
           done(times);
         })();"""
-    return {"step to picture": steps, "why": browser.execute_async_script(ask)}
+    return {"step to frame": steps, "why": browser.execute_async_script(ask)}
 
 
 def main() -> None:

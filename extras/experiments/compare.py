@@ -4,15 +4,15 @@
 
 Looks for the logs in results/ whose settings are those of the run, seed and threads apart. Draws
 the run over the band between their least and greatest values, in compare.png in the run's folder,
-and says in a line a panel where the run stands at its last test point. Curves are means over five
-test points, because one test of 48 forests varies much.
+and says in a line a panel where the run stands at its last validation. Curves are means over five
+validations, because one of 48 forests varies much.
 """
 
+import argparse
 import csv
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import matplotlib
@@ -21,38 +21,34 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from deepflight import Parser, RunConfig, place
-from dqn import DQNConfig, check_output
+from dqn import InputError
 
 ROOT = Path(__file__).parents[2]
-FREE = ("seed", "threads", "test_every")  # settings that may differ
+FREE = ("seed", "threads")  # settings that may differ
 PANELS = {  # column of log.csv -> title, factor
-    "test_over_random": ("flight time over random, %", 100),
-    "test_return": ("return by the paper's reward", 1),
-    "test_crossed": ("crossed, %", 100),
+    "validation_longer": ("episodes longer than random, %", 100),
+    "validation_return": ("return by the paper's reward", 1),
+    "validation_crossed": ("crossed, %", 100),
 }
-POINTS = 5  # test points in a mean
+POINTS = 5  # validations in a mean
 
 
 def settings(folder: Path) -> dict[str, object]:
-    """A training's settings, without those that may differ; a setting that it lacks is as today."""
-    found = asdict(DQNConfig()) | asdict(RunConfig())
-    found |= json.loads((folder / "config.json").read_text())
+    """A training's settings, without those that may differ."""
+    found = json.loads((folder / "config.json").read_text())
     return {key: value for key, value in found.items() if key not in FREE}
 
 
 def curve(folder: Path, column: str) -> tuple[np.ndarray, np.ndarray]:
-    """A column of a log (T,) at the steps (T,), each a mean over the last test points."""
+    """A column of a log (T,) at the steps (T,), each a mean over the last validations."""
     with (folder / "log.csv").open() as file:
         rows = list(csv.DictReader(file))
     step, y = (np.array([float(row[key]) for row in rows]) for key in ("step", column))
-    sums = np.cumsum(np.concatenate([np.zeros(1), y]))  # (T + 1,)
-    first = np.maximum(np.arange(len(y)) + 1 - POINTS, 0)  # (T,)
-    return step, (sums[1:] - sums[first]) / (np.arange(len(y)) + 1 - first)
+    return step, np.array([y[max(i - POINTS, 0) : i].mean() for i in range(1, len(y) + 1)])
 
 
 def peers(folder: Path) -> list[Path]:
-    """The committed trainings with the run's settings. Raises ValueError if there is none."""
+    """The committed trainings with the run's settings. InputError if there is none."""
     mine = settings(folder)
     found = [path.parent for path in (ROOT / "results").rglob("config.json")]
     same = [other for other in found if settings(other) == mine]
@@ -60,7 +56,7 @@ def peers(folder: Path) -> list[Path]:
         return sorted(same)
     nearest = min(found, key=lambda x: len(settings(x).items() ^ mine.items()))
     other = sorted(key for key, value in settings(nearest).items() if mine.get(key) != value)
-    raise ValueError(f"no committed training has these settings; {nearest} differs in {other}")
+    raise InputError(f"no committed training has these settings; {nearest} differs in {other}")
 
 
 def compare(folder: Path, out: Path) -> None:
@@ -79,22 +75,19 @@ def compare(folder: Path, out: Path) -> None:
         ends = f"{factor * low[-1]:.1f} to {factor * high[-1]:.1f}"
         print(f"{title}: {factor * y[-1]:.1f} at step {step[-1]:,.0f}, {place} {ends}")
     axes[0].legend()
-    figure.savefig(out, format="png", dpi=100, metadata={"Software": "Deep Flight"})
+    figure.savefig(out, dpi=100)
     print(f"wrote {out}; {len(others)} committed trainings have these settings")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Compare. Bad input is one line and exit code 2."""
-    parser = Parser(prog="compare", description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=place, help="of a training, such as runs/001")
+    parser = argparse.ArgumentParser(prog="compare", description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, help="of a training, such as runs/001")
+    folder = parser.parse_args(argv).folder
     try:
-        folder = parser.parse_args(argv).folder
-        if not all((folder / name).is_file() for name in ("config.json", "log.csv")):
-            raise ValueError(f"{folder} holds no config.json and log.csv: give a training's folder")
-        check_output(folder / "compare.png", b".PNG.*Deep Flight")
         compare(folder, folder / "compare.png")
-    except ValueError as error:
-        print(f"compare: error: {error}", file=sys.stderr)
+    except (InputError, OSError) as error:
+        print(f"compare: {error}", file=sys.stderr)
         return 2
     return 0
 

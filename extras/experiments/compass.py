@@ -10,9 +10,9 @@ hardly learn from rewards. Asked in forests it has not seen, in the middle (15 m
 every edge) and at the edges (10 m or less from one, and heading for it): how far off it is, and
 which edge it takes the edge for.
 
-And what a compass is worth: how many flights cross by the laser pilot's plan if it takes the middle
-of the forest for its place, and for its heading either 0, whichever way it has come to face; or its
-true heading; or its angle to the rows, whichever way along them is nearer. Writes
+And what a compass is worth: how many episodes cross by the laser pilot's plan if it takes the
+middle of the forest for its place, and for its heading either 0, whichever way it has come to face;
+or its true heading; or its angle to the rows, whichever way along them is nearer. Writes
 results/compass.json.
 """
 
@@ -23,18 +23,20 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from deepflight import EVAL_FIRST, TRAIN_END, RunConfig
-from dqn import DQNConfig, QNetwork, linear_schedule
-from env import STACK, Fleet, World, fly, measure, plan, plant
+from deepflight import TRAIN_END, Config, measure
+from dqn import QNetwork, linear_schedule
+from env import STACK, VecForest, World, fly, plant
+from extras.lessons.expert import plan, scan
 from render import camera
 
 ROOT = Path(__file__).parents[2]
 WORLD = World()
-BATCH, BATCHES, ASKED, FLIGHTS = 64, 10_000, 4_000, 500
+BATCH, BATCHES, ASKED, EPISODES = 64, 10_000, 4_000, 500
+FIRST = 2 * 10**9  # no training or validation plants these forests
 
 
 def somewhere(seed: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Four frames (4, 84, 84) of a straight flight through a forest, and where it ends (3,): x, y
+    """Four frames (4, 84, 84) of a straight way through a forest, and where it ends (3,): x, y
     in m, heading in rad."""
     trunks, size = plant(seed, WORLD), np.array([WORLD.length, WORLD.width])
     while True:
@@ -83,26 +85,26 @@ def learn(rng: np.random.Generator) -> QNetwork:
 
 
 def crossed(fold: int) -> float:
-    """The share in % of FLIGHTS flights by the laser's scan that cross. fold: 0 straight on, 1 by
+    """The share in % of EPISODES by the laser's scan that cross. fold: 0 straight on, 1 by
     compass, 2 along the rows whichever way is nearer."""
 
-    def pilot(fleet: Fleet) -> list[int]:
+    c = Config(forward_reward=0.0, far_bonus=0.0)
+
+    def pilot(_s: np.ndarray, envs: VecForest) -> list[int]:
         actions = []
-        for env in fleet.flying:
-            heading = np.angle(np.exp(1j * fold * env.pose[2])) / max(fold, 1)  # rad
+        for drone in envs.active:
+            heading = np.angle(np.exp(1j * fold * drone.pose[2])) / max(fold, 1)  # rad
             pose = (WORLD.length / 2, 0.0, heading)
-            paid = DQNConfig.gamma, 0.0, RunConfig.goal_value, 0.0
-            worth = plan(*env.scan(), pose, WORLD, *paid)
-            actions.append(int(worth.argmax()))
+            actions.append(int(plan(*scan(drone), pose, WORLD, c).argmax()))
         return actions
 
-    flights = fly(pilot, range(EVAL_FIRST, EVAL_FIRST + FLIGHTS), WORLD, blind=True)
-    return float(100 * measure(flights)["crossed"].mean())
+    episodes = fly(pilot, range(FIRST, FIRST + EPISODES), WORLD, blind=True)
+    return float(100 * measure(episodes)["crossed"].mean())
 
 
 def ask(q: QNetwork, rng: np.random.Generator) -> dict[str, float]:
     """What the network says in forests it has not seen."""
-    places = [somewhere(EVAL_FIRST + i, rng) for i in range(ASKED)]
+    places = [somewhere(FIRST + i, rng) for i in range(ASKED)]
     s, pose = map(np.stack, zip(*places, strict=True))  # (B, 4, 84, 84), (B, 3)
     with torch.no_grad():
         said = np.concatenate([q(torch.from_numpy(x)) for x in np.split(s, 40)])  # (B, 4)
@@ -133,7 +135,7 @@ def main() -> None:
     for fold, name in enumerate(("straight on", "by compass", "along the rows")):
         report[f"the laser pilot, {name}: crossed, %"] = crossed(fold)
     (ROOT / "results/compass.json").write_text(json.dumps(report, indent=1) + "\n")
-    print("\n".join(f"{name}: {figure:.1f}" for name, figure in report.items()))
+    print("\n".join(f"{name}: {value:.1f}" for name, value in report.items()))
 
 
 if __name__ == "__main__":

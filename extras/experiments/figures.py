@@ -3,15 +3,14 @@
     extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.experiments.figures
 
-figures/learning.png: a curve is a training, from rewards or taught, against control steps and
-against flights; Mnih's settings are rung 0 of the ladder.
+figures/learning.png: a curve is a training, against control steps and against episodes.
 figures/crossed.png: what crosses in the paper's world, beside the laser pilot with and without a
-compass. figures/flight.gif: a flight of results/eval.json, flown again, with the values that
-weights/paper.pt gives to each turn.
+compass. figures/flight.gif: the first episode of results/eval.json that crosses, flown again, with
+the values that weights/dqn.pt gives to each turn.
 """
 
-import csv
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import matplotlib
@@ -21,50 +20,38 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from deepflight import film
-from dqn import load_weights
-from env import World, measure
+from deepflight import draw_film, load_weights, measure
 from render import save_film
 
 ROOT = Path(__file__).parents[2]
 PAPER = 1.8  # the paper's figure: 180 % more flight time than random [DF, abstract]
 PANELS = {  # column of log.csv -> title
-    "train_return": "Figure 2: total reward in training,\nmean of 100 flights",
-    "test_return": "Figure 3: total reward on the test forests",
-    "test_steps": "Figure 4: flight time on the test forests, steps",
+    "train_return": "Figure 2: total reward in training,\nmean of 100 episodes",
+    "validation_return": "Figure 3: total reward in validation",
+    "validation_steps": "Figure 4: steps of an episode in validation",
 }
-CURVES = {  # label -> folders in results/, one a seed, and the colour in the picture
-    "from rewards": ("scratch*", "C0"),
-    "with the beacon": ("beacon-scratch", "C1"),
-    "Mnih's settings": ("ladder/0-0", "C2"),
-    "taught": ("paper", "C3"),
-    "taught, with the beacon": ("beacon", "C4"),
+CURVES = {  # label -> folders in results/, one a seed, and the colour
+    "from rewards": (("dqn", "dqn-1", "dqn-2"), "C0"),
+    "imitation": (("imitation",), "C3"),
 }
-AXES = {"step": "control steps", "episodes": "flights"}  # column of log.csv -> label
-Log = dict[str, np.ndarray]  # the columns of a log.csv (T,)
+AXES = {"step": "control steps", "episodes": "episodes"}  # column of log.csv -> label
+Log = np.ndarray  # (T,) with the columns of a log.csv as fields
 
 
-def read(path: Path) -> Log:
-    """The columns of a CSV file of numbers (T,)."""
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
-    return {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
+def logs(folders: Iterable[str]) -> list[Log]:
+    """The logs of those of these folders of results/ that have one."""
+    paths = [ROOT / "results" / folder / "log.csv" for folder in folders]
+    return [np.genfromtxt(p, delimiter=",", names=True, ndmin=1) for p in paths if p.exists()]
 
 
-def logs(folders: str) -> list[Log]:
-    """The logs of these folders of results/, seed 0 first."""
-    return [read(path) for path in sorted(ROOT.glob(f"results/{folders}/log.csv"))]
-
-
-def levels(axes: plt.Axes, column: str, log: Log) -> None:
+def levels(axes: plt.Axes, column: str, log: Log, report: dict) -> None:
     """The random pilot, and the paper's 180 % above it."""
-    if column == "test_steps":
-        bar = log["test_steps"][-1] / (1 + log["test_over_random"][-1])  # steps
-        axes.axhline((1 + PAPER) * bar, color="black", linestyle="--", label="the paper: +180 %")
-    else:
-        flown = json.loads((ROOT / "results/pilots.json").read_text())["pilots"]
-        bar = flown["random"]["return"]["value"]
-    axes.axhline(bar, color="black", linestyle=":", label="random pilot")
+    baseline = report["pilots"]["random"]["return"]["value"]
+    if column == "validation_steps":
+        baseline = log["validation_steps"][-1] / (1 + log["validation_longer"][-1])
+        level = (1 + PAPER) * baseline
+        axes.axhline(level, color="black", linestyle="--", label="the paper: +180 %")
+    axes.axhline(baseline, color="black", linestyle=":", label="random pilot")
 
 
 def finish(figure: Figure, name: str) -> None:
@@ -76,15 +63,15 @@ def finish(figure: Figure, name: str) -> None:
     print(f"wrote figures/{name}")
 
 
-def draw_learning() -> None:
-    """Three panels against control steps, and three against flights."""
+def draw_learning(report: dict) -> None:
+    """Three panels against control steps, and three against episodes."""
     figure, panels = plt.subplots(2, 3, figsize=(13, 7), sharey="col", layout="constrained")
     for row, (x, text) in zip(panels, AXES.items(), strict=True):
         for axes, (column, title) in zip(row, PANELS.items(), strict=True):
             for label, (folders, colour) in CURVES.items():
                 for log in logs(folders):
                     axes.plot(log[x], log[column], colour, label=label, linewidth=1)
-            levels(axes, column, log)
+            levels(axes, column, log, report)
             axes.set(xlabel=text, xscale="log")
             if x == "step":
                 axes.set_title(title, fontsize=11)
@@ -95,14 +82,17 @@ def draw_learning() -> None:
 
 
 def draw_crossed() -> None:
-    """The share of test flights that cross, a mean over five test points."""
+    """The share of validation episodes that cross, a mean over 25,000 control steps."""
     figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
-    for seed, log in enumerate(logs("scratch*")):
-        label = f"from rewards, seed {seed}"
-        share = np.convolve(100 * log["test_crossed"], np.ones(5) / 5, "valid")  # (T - 4,) %
-        axes.plot(log["step"][4:], share, f"C{seed}", label=label, linewidth=1.2)
-    (log,) = logs("paper")
-    axes.plot(log["step"], 100 * log["test_crossed"], "C3", label="taught", linewidth=1.2)
+    for label, (folders, colour) in CURVES.items():
+        for seed, log in enumerate(logs(folders)):
+            width = max(25_000 // int(log["step"][0]), 1)  # validations in a mean
+            share = np.convolve(100 * log["validation_crossed"], np.ones(width) / width, "valid")
+            name = f"{label}, seed {seed}"
+            line = ("-", "--", "-.")[seed]
+            axes.plot(
+                log["step"][width - 1 :], share, colour, linestyle=line, label=name, linewidth=1.2
+            )
     laser = json.loads((ROOT / "results/compass.json").read_text())
     for way, line in (("straight on", ":"), ("by compass", "--")):
         y = laser[f"the laser pilot, {way}: crossed, %"]
@@ -114,14 +104,14 @@ def draw_crossed() -> None:
 
 def main() -> None:
     """The curves, then the film."""
-    draw_learning()
-    draw_crossed()
     report = json.loads((ROOT / "results/eval.json").read_text())
-    flights = {name: pilot["flights"] for name, pilot in report["pilots"].items()}
-    q = load_weights(ROOT / "weights/paper.pt", World.actions, beacon=False, camera="grey")
-    first = int(measure(flights["dqn"])["crossed"].argmax())  # to cross
-    pictures = film({name: flown[first] for name, flown in flights.items()}, World(), q)
-    save_film(ROOT / "figures/flight.gif", pictures, round(1000 * World.dt))
+    draw_learning(report)
+    draw_crossed()
+    q, world, name = load_weights(ROOT / "weights/dqn.pt")
+    episodes = report["pilots"][name]["episodes"]
+    shown = episodes[measure(episodes)["crossed"].argmax()]
+    with (ROOT / "figures/flight.gif").open("wb") as file:
+        save_film(file, draw_film(shown, world, q, name), round(1000 * world.dt))
     print("wrote figures/flight.gif")
 
 

@@ -6,22 +6,22 @@
     .venv/bin/python -m extras.experiments.looks time    # leave the machine alone: half a minute
 
 A look changes what the camera delivers, and leaves every trunk where it is. LOOKS change a grey
-picture: the paint, the light, the air, the lens, the sensor. In our disparity only the air counts,
+frame: the paint, the light, the air, the lens, the sensor. In our disparity only the air counts,
 because haze ends its view too. All else is left out of it: disparity is a matter of geometry.
 STEREO is what a stereo camera gets wrong instead. The paint of a trunk is uniform, so a matcher
 finds its two edges and guesses between them: that is where holes are.
 
-Four pilots fly each look through the same 200 forests, which no training, test or evaluation uses:
-the shipped ones of plain grey and plain disparity, and two whose training drew a look for each
-forest at random, from wider ranges than the looks that are flown. `train` makes these two, in
-runs/looks-grey and runs/looks-disparity, with the planner as their teacher. `fly` writes
-results/transfer.json, with paired intervals: the same forests, drawn again 2,000 times. `draw`
-draws figures/transfer.png. `time` compares how long a picture of either camera takes.
+Four imitated pilots fly each look through the same 200 forests: the shipped ones of plain grey and
+plain disparity, and two whose training drew a look for each forest at random, from wider ranges
+than the looks that are flown. `train` makes these two, in runs/looks-grey and runs/looks-disparity.
+`fly` writes results/transfer.json, with paired intervals: the same forests, drawn again 2,000
+times. `draw` draws figures/transfer.png. `time` compares how long a frame of either camera takes.
 
-A look is a function of forest and pose alone, noise included. So a flight stays its seed and its
+A look is a function of forest and pose alone, noise included. So an episode stays its seed and its
 actions, and an interrupted training can go on.
 """
 
+import argparse
 import json
 import subprocess
 import sys
@@ -30,6 +30,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +42,10 @@ from PIL import Image, ImageDraw
 
 import deepflight
 import env
-from deepflight import FLAGS, configure, dqn_pilot, interval, summarize
-from dqn import load, load_weights, lock_folder
-from env import Flights, World, fly, fly_random, measure, plant
-from render import CAMERAS, PIXELS, SLOPES, Scene, backdrop, camera, fade
+from deepflight import dqn_pilot, fly_random, interval, load, load_weights, measure, summarize
+from env import Episode, World, fly, plant
+from extras.lessons import expert
+from render import CAMERAS, PIXELS, SLOPES, Scene, background, camera, shade
 
 ROOT = Path(__file__).parents[2]
 RESULT, FIGURE = ROOT / "results/transfer.json", ROOT / "figures/transfer.png"
@@ -55,14 +56,14 @@ STEREO_PIXEL = 13  # levels of disparity in one pixel of a 640-pixel pair with a
 
 @dataclass(frozen=True)
 class Look:
-    """What a camera makes of the same forest. Levels are those of a picture, 0 to 255."""
+    """What a camera makes of the same forest. Levels are those of a frame, 0 to 255."""
 
     scene: dict[str, Any] = field(default_factory=dict)  # fields of render.Scene
     stripes: float = 0.0  # m, the height of a bright ring of bark, and of the dark one above it
     gain: float = 1.0  # by which light is multiplied
     vignette: float = 0.0  # the share of light that is lost in the corners
     blur: bool = False  # the mean of 3x3 pixels
-    noise: float = 0.0  # levels, standard deviation, in every pixel of a grey picture
+    noise: float = 0.0  # levels, standard deviation, in every pixel of a grey frame
     error: float = 0.0  # the same of disparity: in depth the error grows with the depth's square
     holes: float = 0.0  # the share of 4x4 blocks in a trunk that a matcher finds no depth for
     filled: bool = False  # a hole gets the last depth to its left, and not 0
@@ -92,17 +93,17 @@ STEREO = {
     "all together": Look(error=4.0, holes=0.5, filled=True, quantum=STEREO_PIXEL, fat=1),
 }
 PILOTS = {  # name -> camera, weights
-    "grey": ("grey", ROOT / "weights/paper.pt"),
+    "grey": ("grey", ROOT / "weights/imitation.pt"),
     "grey, random looks": ("grey", ROOT / "runs/looks-grey/best.pt"),
-    "disparity": ("disparity", ROOT / "weights/disparity.pt"),
+    "disparity": ("disparity", ROOT / "weights/imitation-disparity.pt"),
     "disparity, random noise": ("disparity", ROOT / "runs/looks-disparity/best.pt"),
 }
-CHANGES = {  # figure -> its name in `measure`; is it counted in mean flights of random?
-    "crossed": ("crossed", False), "crash": ("crash", False), "over_random": ("steps", True),
+CHANGES = {  # metric -> its name in `measure`; is it counted in mean episodes of random?
+    "crossed": ("crossed", False), "crash": ("crash", False), "longer": ("steps", True),
 }  # fmt: skip
 Trunks = Sequence[ndarray]
 Seeing = Callable[..., ndarray]  # like render.camera
-COLUMNS, TILE = 5, (174, 212)  # of the picture; px
+COLUMNS, TILE = 5, (174, 212)  # of the drawing; px
 POSE = np.array([[43.0, -12.85, 0.19]])  # where it is taken: x, y in m, heading in rad
 
 
@@ -129,15 +130,15 @@ def stereo(scene: Scene) -> Scene:
 
 def ringed(frames: ndarray, look: Look, scene: Scene, seen: ndarray) -> ndarray:
     """Paint bright rings on the trunks. seen: the disparity of the same view, (E, 84, 84)."""
-    bark = seen > backdrop(stereo(scene))  # (E, 84, 84)
+    trunk = seen > background(stereo(scene))  # (E, 84, 84)
     depth = 255 * scene.near / np.maximum(seen, 1)  # (E, 84, 84) m
     height = scene.altitude + SLOPES[:, None] * depth  # (E, 84, 84) m above the ground
-    ring = bark & (np.floor(height / look.stripes) % 2 == 0)  # (E, 84, 84)
-    return np.where(ring, fade(np.float64(200), depth, scene), frames)
+    ring = trunk & (np.floor(height / look.stripes) % 2 == 0)  # (E, 84, 84)
+    return np.where(ring, shade(200, depth, depth, scene), frames)
 
 
 def expose(frame: ndarray, look: Look, _scene: Scene, rng: Generator) -> ndarray:
-    """Light, lens and sensor of a grey picture (84, 84)."""
+    """Light, lens and sensor of a grey frame (84, 84)."""
     grey = frame * look.gain * (1 - look.vignette * (SLOPES**2 + SLOPES[:, None] ** 2) / 2)
     if look.blur:
         wide = np.pad(grey, 1, mode="edge")  # (86, 86)
@@ -152,15 +153,15 @@ def static(deviation: float, rng: Generator) -> ndarray:
 
 
 def mismatch(frame: ndarray, look: Look, scene: Scene, rng: Generator) -> ndarray:
-    """What a matcher gets wrong in a picture of disparity (84, 84)."""
+    """What a matcher gets wrong in a frame of disparity (84, 84)."""
     seen = frame.astype(float)
     if look.fat:  # the nearer side of an edge grows
         padded = np.pad(seen, ((0, 0), (look.fat, 2 * look.fat)))
         shifted = [padded[:, i : i + PIXELS] for i in range(3 * look.fat + 1)]
         seen = np.maximum.reduce(shifted)  # (84, 84)
     if look.holes:
-        bark = seen > backdrop(scene)  # (84, 84)
-        inside = bark & np.roll(bark, 1, 1) & np.roll(bark, -1, 1)  # (84, 84) not the two edges
+        trunk = seen > background(scene)  # (84, 84)
+        inside = trunk & np.roll(trunk, 1, 1) & np.roll(trunk, -1, 1)  # (84, 84) not the two edges
         blocks = rng.random((21, 21)) < look.holes
         hole = inside & np.kron(blocks, np.ones((4, 4), bool))  # (84, 84)
         last = np.maximum.accumulate(np.where(hole, 0, np.arange(84)), 1)  # (84, 84) no hole
@@ -210,19 +211,16 @@ def seeing(see: Seeing) -> Iterator[None]:
 # -------------------------------------------------- train, fly
 
 
-def train(kind: str) -> None:
-    """Train a pilot whose every forest has a look of its own, or go on, or do nothing if done."""
+def train(kind: str) -> int:
+    """Imitate the expert in forests that each have a look of their own, or go on with it."""
     folder = ROOT / f"runs/looks-{kind}"
     if trained(folder / "best.pt"):
-        return
+        return 0
+    words = ["--name", folder.name, "--camera", kind]
+    if (folder / "checkpoint.pt").exists():
+        words = ["--resume", str(folder)]
     with seeing(wear_at_random):
-        if (folder / "checkpoint.pt").exists():
-            deepflight.resume_training(folder, {})
-            return
-        c, rc = configure(FLAGS["teacher"] | {"teacher": True, "camera": kind, "threads": 1})
-        folder.mkdir(parents=True)
-        with lock_folder(folder):
-            deepflight.train(c, rc, folder)
+        return deepflight.main(["train", *words], expert.ExpertConfig, expert.train)
 
 
 def trained(weights: Path) -> bool:
@@ -230,8 +228,8 @@ def trained(weights: Path) -> bool:
     checkpoint = weights.with_name("checkpoint.pt")
     if not checkpoint.exists():
         return weights.exists()
-    saved = load(checkpoint, "checkpoint")
-    return saved["book"]["step"] >= saved["settings"]["steps"]
+    saved = load(checkpoint, "config", "actions")
+    return len(saved["actions"]) * saved["config"]["num_envs"] >= saved["config"]["steps"]
 
 
 def train_all() -> None:
@@ -242,32 +240,26 @@ def train_all() -> None:
         sys.exit("looks: a training failed")
 
 
-def flown(pilot: str, look: str) -> Flights:
-    """This pilot's flights through the forests, in this look."""
+def flown(pilot: str, look: str) -> list[Episode]:
+    """This pilot's episodes, in this look."""
     torch.set_num_threads(1)
-    kind, path = PILOTS[pilot]
-    q = load_weights(path, World.actions, beacon=False, camera=kind)
-
-    def see(*scene: Any) -> ndarray:
-        return wear((LOOKS | STEREO)[look], *scene)
-
-    with seeing(see):
-        return fly(dqn_pilot(q), FORESTS, World(camera=kind))
+    q, world, _ = load_weights(PILOTS[pilot][1])
+    with seeing(partial(wear, (LOOKS | STEREO)[look])):
+        return fly(dqn_pilot(q), FORESTS, world)
 
 
 def fly_all() -> None:
     """Every pilot that is trained and not yet flown, in every look of its camera."""
-    rng, report = np.random.default_rng(0), reported()
-    bar = fly_random(FORESTS, World(), rng)
-    draws = rng.integers(len(FORESTS), size=(2000, len(FORESTS)))  # (2000, F)
+    report, baseline = reported(), fly_random(FORESTS, World())
+    draws = np.random.default_rng(0).integers(len(FORESTS), size=(2000, len(FORESTS)))
     for pilot, (kind, path) in PILOTS.items():
         if pilot in report or not trained(path):
             continue
         looks = list(LOOKS if kind == "grey" else LOOKS | STEREO)
         with ProcessPoolExecutor(2) as pool:
-            flights = dict(zip(looks, pool.map(flown, [pilot] * len(looks), looks), strict=True))
+            episodes = dict(zip(looks, pool.map(flown, [pilot] * len(looks), looks), strict=True))
         report[pilot] = {
-            look: compare(flights[look], flights["plain"], bar, draws) for look in looks
+            look: compare(episodes[look], episodes["plain"], baseline, draws) for look in looks
         }
         RESULT.write_text(json.dumps(report, indent=1) + "\n")
         for look, found in report[pilot].items():
@@ -276,25 +268,27 @@ def fly_all() -> None:
 
 
 def reported() -> dict[str, dict]:
-    """What has been flown: pilot -> look -> figure, and under "change" what the look changes."""
+    """What has been flown: pilot -> look -> metric, and under "change" what the look changes."""
     return json.loads(RESULT.read_text()) if RESULT.exists() else {}
 
 
-def compare(flights: Flights, plain: Flights, bar: Flights, draws: ndarray) -> dict[str, dict]:
-    """What `eval` would say of these flights, and the change from plain, forest by forest."""
-    found, changes = summarize(flights, bar, draws), {}
-    a, b, per = measure(flights), measure(plain), measure(bar)["steps"].mean()
-    for key, (figure, unit) in CHANGES.items():
-        change = (a[figure].astype(float) - b[figure]) / (per if unit else 1)  # (F,)
+def compare(
+    episodes: list[Episode], plain: list[Episode], baseline: list[Episode], draws: ndarray
+) -> dict[str, dict]:
+    """What `eval` would say of these episodes, and the change from plain, forest by forest."""
+    found, changes = summarize(episodes, baseline, draws), {}
+    a, b, per = measure(episodes), measure(plain), measure(baseline)["steps"].mean()
+    for key, (metric, relative) in CHANGES.items():
+        change = (a[metric].astype(float) - b[metric]) / (per if relative else 1)  # (F,)
         changes[key] = interval(change.mean(), change[draws].mean(1))
     return found | {"change": changes}
 
 
-# -------------------------------------------------- picture
+# -------------------------------------------------- the drawing
 
 
 def draw() -> None:
-    """A tile a look: what the network sees, and how many of its flights cross."""
+    """A tile a look: what the network sees, and how many of its episodes cross."""
     report = reported()
     hazes = {name: look for name, look in LOOKS.items() if "view" in look.scene}
     parts = (("grey", LOOKS), ("disparity", {"plain": Look(), **hazes} | STEREO))
@@ -314,7 +308,7 @@ def draw() -> None:
 
 
 def time_both() -> None:
-    """How long eight pictures of disparity take, as a share of eight grey ones; in turn."""
+    """How long eight frames of disparity take, as a share of eight grey ones; in turn."""
     rng, worlds = np.random.default_rng(0), [World(camera=kind) for kind in CAMERAS]
     trunks = [plant(seed, worlds[0]) for seed in range(8)]
     taken = np.zeros((200, 2))  # s
@@ -326,18 +320,18 @@ def time_both() -> None:
                 camera(eight, trunks, world)
             row[i] = time.perf_counter() - start
     ratio = np.median(taken[:, 1] / taken[:, 0])
-    print(f"disparity / grey {ratio:.2f}; eight grey pictures {taken[:, 0].min() * 20:.2f} ms")
+    print(f"disparity / grey {ratio:.2f}; eight grey frames {taken[:, 0].min() * 20:.2f} ms")
 
 
-def main() -> None:
+def main() -> int | None:
     """One of the four commands."""
     commands = {"train": train_all, "fly": fly_all, "draw": draw, "time": time_both}
-    if len(sys.argv) == 3 and sys.argv[1] == "train" and sys.argv[2] in CAMERAS:
-        return train(sys.argv[2])
-    if len(sys.argv) != 2 or sys.argv[1] not in commands:
-        sys.exit(f"looks: the command is {sys.argv[1:]}, allowed are {', '.join(commands)}")
-    return commands[sys.argv[1]]()
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("command", choices=commands)
+    parser.add_argument("camera", nargs="?", choices=CAMERAS, help="train this pilot alone")
+    args = parser.parse_args()
+    return train(args.camera) if args.camera else commands[args.command]()
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -5,7 +5,7 @@
 `ray.cluster_utils.Cluster` makes the nodes, all on this machine, so they share its processors: the
 numbers say what RLlib does with nodes, and not what machines would add. Each node flies one runner.
 The script trains by `extras.bridges.rllib_train --address` on one, two and three nodes, and on
-three of which one is killed after the first thousand steps. All flights end before much is learnt:
+three of which one is killed after the first thousand steps. All of it ends before much is learnt:
 the learner, of which there is one, would hide what the nodes add.
 """
 

@@ -2,17 +2,13 @@
 
     xvfb-run -a extras/.venv/bin/python -m extras.experiments.bench    # times them in turns
 
-What to install stands in bench.py. Most runners are generators: each works when asked for more,
-yields how many steps it has just done, and never ends. `training` has an end, so it clocks itself.
-Not in this file: ratios, and what the numbers mean.
+What to install stands in bench.py. Each runner is a generator: it works when asked for more, yields
+how many steps it has just done, and never ends. Not in this file: what the numbers mean.
 """
 
-import io
 import os
-import signal
 from collections.abc import Iterator
-from contextlib import closing, redirect_stdout
-from dataclasses import replace
+from contextlib import closing
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,38 +17,28 @@ import gymnasium
 import numpy as np
 import vizdoom
 
-from deepflight import RunConfig, train
-from dqn import DQNConfig, load
-from env import Fleet, ForestEnv, World
+import dqn
+from deepflight import Config, Run
+from env import VecForest, World
 from extras.bridges.sb3_train import make_model
 
-REPLAY = 20_000  # transitions: Stable-Baselines3's take 1.1 GB
-DRONES, STEPS = 8, 800  # side by side; of a training that is timed
-PLAIN = DQNConfig(  # 1-step DQN, past exploration
-    **{"replay_size": REPLAY, "learning_starts": 400, "epsilon_decay": 1, "num_envs": DRONES},
-    **{"double": False, "n_steps": 1, "mirror": False, "average": 0.0},
+REPLAY, DRONES = 20_000, 8  # transitions: Stable-Baselines3's take 1.1 GB; side by side
+PLAIN = Config(  # 1-step DQN, past exploration
+    **{"steps": 10**9, "replay_size": REPLAY, "learning_starts": 400, "epsilon_decay": 1},
+    **{"double": False, "n_steps": 1, "mirror": False, "swa_fraction": 0.0},
+    num_envs=DRONES,
+    threads=2,
 )
-RUN = RunConfig(test_every=10**9)
 RNG = np.random.default_rng(0)
 
 
-def forest() -> Iterator[int]:
-    """Our environment, eight drones side by side."""
-    fleet, seeds = Fleet(World(), DRONES), count()
+def forest(drones: int) -> Iterator[int]:
+    """Our environment, so many drones side by side."""
+    envs = VecForest(World(), drones, count())
     while True:
-        fleet.reset(fleet.landed, [next(seeds) for _ in fleet.landed])
-        fleet.step(RNG.integers(World.actions, size=DRONES))
-        yield DRONES
-
-
-def forest_alone() -> Iterator[int]:
-    """Our environment, one drone."""
-    env = ForestEnv()
-    while True:
-        env.reset()
-        while not env.outcome:
-            env.step(int(RNG.integers(World.actions)))
-            yield 1
+        envs.reset_done()
+        envs.step(RNG.integers(World.actions, size=drones))
+        yield drones
 
 
 def doom(scenario: str) -> Iterator[int]:
@@ -91,7 +77,7 @@ def rooms(scene: str) -> Iterator[int]:
 
 def sb3() -> Iterator[int]:
     """Stable-Baselines3's training, past its warm-up."""
-    model = make_model(PLAIN, RUN, REPLAY)
+    model = make_model(PLAIN, REPLAY)
     model.verbose = 0
     model.learn(PLAIN.learning_starts)
     while True:
@@ -99,24 +85,11 @@ def sb3() -> Iterator[int]:
         yield 200
 
 
-def training(bfloat16: bool) -> float:
-    """Steps a second of our training, past its warm-up: a long training less a short one."""
-    short, long = PLAIN.learning_starts, PLAIN.learning_starts + STEPS
-    c = replace(PLAIN, bfloat16=bfloat16)
-    return STEPS / (seconds(replace(c, steps=long)) - seconds(replace(c, steps=short)))
-
-
-def seconds(c: DQNConfig) -> float:
-    """What the steps of one whole training take, flying and learning, by its own clock.
-
-    The clock starts after the random pilot's flights and is read before the last test point.
-    """
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    with TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):
-        try:
-            if train(c, RUN, Path(folder)):
-                raise KeyboardInterrupt  # the training has taken the signal for itself
-        finally:
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-        return load(Path(folder) / "checkpoint.pt", "checkpoint")["book"]["seconds"]
+def ours(bfloat16: bool) -> Iterator[int]:
+    """Our training, past its warm-up."""
+    run = Run(dqn.train, PLAIN, Path())  # it writes nothing there
+    while True:
+        dqn.BFLOAT16 = bfloat16  # each time, because two trainings take turns
+        next(run.loop)
+        if run.envs.steps > PLAIN.learning_starts:
+            yield DRONES

@@ -4,15 +4,16 @@
 
 "The UAV tends to stay inside the obstacle forest, veering towards the middle of the environment if
 one of the sides of the image is free from clutter." Clutter on a side is the share of its 42
-columns with a trunk at the horizon. We fly weights/paper.pt and the random pilot through the first
-100 evaluation forests and measure, with 95 % intervals by bootstrap over flights,
+columns with a trunk at the horizon. We fly the random pilot, weights/dqn.pt and
+weights/imitation.pt through the first 100 test forests and measure, with 95 % intervals by
+bootstrap over episodes,
 
     towards clutter  the mean yaw rate, rad/s, positive towards the more cluttered side
     one side free    the same where one side has no trunk and the other has some
     towards middle   the mean yaw rate within 5 m of a side edge, positive away from that edge
     edge time        the share of all steps flown within 5 m of a side edge
 
-Writes results/veer.json. Takes about two minutes.
+Writes results/veer.json. Takes about three minutes.
 """
 
 import json
@@ -21,37 +22,31 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import deepflight
-from dqn import load_weights
-from env import World, fly, random_pilot, refly
-from render import PIXELS, backdrop
+from deepflight import dqn_pilot, interval, load_weights
+from env import Episode, World, fly, random_pilot, refly
+from render import PIXELS, background
 
 ROOT = Path(__file__).parents[2]
-FORESTS, NEAR = 100, 5.0  # m from a side edge
+FIRST, FORESTS, NEAR = 2 * 10**9, 100, 5.0  # NEAR: m from a side edge
 WORLD = World()
 
 
 def clutter(frame: np.ndarray) -> tuple[float, float]:
     """The left and the right half's share of columns with a trunk; frame (84, 84)."""
     row = PIXELS // 2  # just below the horizon
-    trunk = frame[row] < backdrop(WORLD)[row]  # (84,)
+    trunk = frame[row] < background(WORLD)[row]  # (84,)
     return float(trunk[:row].mean()), float(trunk[row:].mean())
 
 
-def look(flight: dict) -> np.ndarray:
+def look(episode: Episode) -> np.ndarray:
     """Fly again: left and right clutter, y in m, yaw rate in rad/s at every action (T, 4)."""
-    steps = list(refly(flight["seed"], flight["actions"], WORLD))[:-1]
     rates = WORLD.yaw_rate * np.linspace(-1, 1, WORLD.actions)  # (A,) rad/s
-    return np.array(
-        [
-            (*clutter(observation[-1]), info["pose"][1], rates[int(a)])
-            for (observation, *_, info), a in zip(steps, flight["actions"], strict=True)
-        ]
-    )
+    flown = zip(refly(episode, WORLD), episode["actions"], strict=False)  # without the last frame
+    return np.array([(*clutter(s[-1]), drone.pose[1], rates[int(a)]) for (s, drone), a in flown])
 
 
 def measures(x: np.ndarray) -> dict[str, np.ndarray]:
-    """The values of each measure at the steps of one flight where it applies."""
+    """The values of each measure at the steps of one episode where it applies."""
     left, right, y, yaw = x.T
     towards, free = yaw * np.sign(left - right), (left == 0) != (right == 0)
     edge = np.abs(y) > WORLD.width / 2 - NEAR
@@ -63,37 +58,35 @@ def measures(x: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def figures(flights: list[dict]) -> dict[str, dict[str, float] | None]:
-    """Each measure over all steps of all flights, flights resampled for the interval.
+def metrics(episodes: list[Episode]) -> dict[str, dict[str, float] | None]:
+    """Each measure over all steps of all episodes, episodes resampled for the interval.
 
-    None where no flight ever came to where it could be measured.
+    None where no episode ever came to where it could be measured.
     """
-    table, parts = {}, [measures(look(flight)) for flight in flights]
+    table, parts = {}, [measures(look(episode)) for episode in episodes]
     draws = np.random.default_rng(0).integers(len(parts), size=(2000, len(parts)))
     for name in parts[0]:
         sums = np.array([part[name].sum() for part in parts])  # (F,)
         counts = np.array([len(part[name]) for part in parts])  # (F,)
         resampled = sums[draws].sum(1) / np.maximum(counts[draws].sum(1), 1)
         mean = sums.sum() / max(counts.sum(), 1)
-        table[name] = deepflight.interval(mean, resampled) if counts.any() else None
+        table[name] = interval(mean, resampled) if counts.any() else None
     return table
 
 
 def show(x: dict[str, float] | None) -> str:
-    """A figure and its interval."""
+    """A metric and its interval."""
     return "{value:.3f} [{low:.3f}, {high:.3f}]".format(**x) if x else "never there"
 
 
 def main() -> None:
-    """Fly both pilots, print the table, write it."""
+    """Fly all pilots, print the table, write it."""
     torch.set_num_threads(2)
-    q = load_weights(ROOT / "weights/paper.pt", WORLD.actions, beacon=False, camera="grey")
-    pilots = {
-        "random": random_pilot(np.random.default_rng(0)),
-        "dqn": deepflight.dqn_pilot(q),
-    }
-    seeds = range(deepflight.EVAL_FIRST, deepflight.EVAL_FIRST + FORESTS)
-    table = {name: figures(fly(p, seeds, WORLD)) for name, p in pilots.items()}
+    pilots = {"random": random_pilot(np.random.default_rng(0))}
+    for name in ("dqn", "imitation"):
+        pilots[name] = dqn_pilot(load_weights(ROOT / f"weights/{name}.pt")[0])
+    seeds = range(FIRST, FIRST + FORESTS)
+    table = {name: metrics(fly(pilot, seeds, WORLD)) for name, pilot in pilots.items()}
     print(f"{'':18}" + "".join(f"{name:>28}" for name in table))
     for measure in table["dqn"]:
         cells = (show(table[name][measure]) for name in table)

@@ -4,7 +4,6 @@ Skipped where Debian's packages chromium and chromium-driver are missing.
 """
 
 import json
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,10 +17,10 @@ from selenium.webdriver import ActionChains, Chrome, Keys
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
-from deepflight import dqn_pilot, read_flights
-from dqn import QNetwork, load_weights
-from env import ForestEnv, World, fly, refly
-from extras.cockpit.flights import ROOT
+from deepflight import dqn_pilot, load_weights
+from dqn import QNetwork
+from env import Drone, World, fly, refly
+from extras.cockpit.episodes import ROOT
 from extras.experiments.cockpit_pictures import (
     CHROMIUM,
     DRIVER,
@@ -31,6 +30,7 @@ from extras.experiments.cockpit_pictures import (
     value,
     visit,
 )
+from extras.lessons.expert import DemoConfig, read_demos
 from render import camera
 
 if not (CHROMIUM.exists() and DRIVER.exists()):
@@ -53,7 +53,7 @@ def chromium() -> Iterator[Chrome]:
 
 @pytest.fixture
 def browser(chromium: Chrome) -> Iterator[Chrome]:
-    """No test may leave a line on the console, or a flight to be saved."""
+    """No test may leave a line on the console, or an episode to be saved."""
     chromium.get_log("browser")
     yield chromium
     chromium.execute_script("sessionStorage.clear()")
@@ -81,12 +81,12 @@ def button(browser: Chrome, group: str, name: str) -> None:
 
 
 def steered(browser: Chrome, host: str) -> dict:
-    """Fly forest 1 by hand to its end, with some turns; the flight's record."""
+    """Fly forest 1 by hand to its end, with some turns; the episode's record."""
     visit(browser, host, seed=SEED)
     browser.execute_script("document.getElementById('speed').value = '5'")
     press(browser, Keys.ARROW_LEFT)
-    until(browser, "over() && landed.size")
-    return value(browser, "flight.record")
+    until(browser, "over() && done.size")
+    return value(browser, "episode.record")
 
 
 def test_it_loads_and_says_how_to_begin(browser: Chrome, host: str) -> None:
@@ -99,16 +99,16 @@ def test_it_loads_and_says_how_to_begin(browser: Chrome, host: str) -> None:
 
 
 def test_the_network_flies_to_the_end_that_eval_finds(browser: Chrome, host: str) -> None:
-    q = load_weights(ROOT / "weights/paper.pt", 9, beacon=False, camera="grey")
-    (flight,) = fly(dqn_pilot(q), [SEED], World())
+    q = load_weights(ROOT / "weights/dqn.pt")[0]
+    (episode,) = fly(dqn_pilot(q), [SEED], World())
     visit(browser, host, seed=SEED)
     browser.execute_script("document.getElementById('speed').value = '5'")
     button(browser, "pilots", "network")
-    until(browser, "flight && over() && t === end() && !playing")
-    assert value(browser, "flight.record") == flight
+    until(browser, "episode && over() && t === end() && !playing")
+    assert value(browser, "episode.record") == episode
     rows = [row.split() for row in text(browser, "table").splitlines()]
-    assert ["steps", str(flight["steps"])] in rows
-    assert ["total", "reward", f"{flight['return']:.1f}"] in rows
+    assert ["steps", str(episode["steps"])] in rows
+    assert ["total", "reward", f"{episode['return']:.1f}"] in rows
 
 
 def test_the_arrow_keys_turn_the_drone(browser: Chrome, host: str) -> None:
@@ -117,12 +117,12 @@ def test_the_arrow_keys_turn_the_drone(browser: Chrome, host: str) -> None:
         press(browser, arrow)
         until(browser, "end() >= 2")
         press(browser, Keys.SPACE)
-        first = value(browser, "flight.moments[1].pose")
+        first = value(browser, "episode.moments[1].pose")
         assert first[2] == pytest.approx(side * 0.1 * 0.7 / 4)
-        env = ForestEnv(World(), blind=True)
-        env.reset(seed=SEED)
-        env.step(4 + side)
-        assert first == [*env.pose]
+        drone = Drone(World())
+        drone.reset(SEED)
+        drone.step(4 + side)
+        assert first == [*drone.pose]
 
 
 def test_holding_a_key_turns_harder(browser: Chrome, host: str) -> None:
@@ -132,7 +132,7 @@ def test_holding_a_key_turns_harder(browser: Chrome, host: str) -> None:
     until(browser, "end() >= 6")
     ActionChains(browser).key_up(Keys.ARROW_LEFT).perform()
     press(browser, Keys.SPACE)
-    assert value(browser, "flight.actions").startswith("567888")
+    assert value(browser, "episode.actions").startswith("567888")
 
 
 def test_keys_play_pause_step_and_change_the_forest(browser: Chrome, host: str) -> None:
@@ -144,7 +144,7 @@ def test_keys_play_pause_step_and_change_the_forest(browser: Chrome, host: str) 
     press(browser, Keys.SPACE)
     assert value(browser, "playing") is False
     press(browser, "n")
-    until(browser, "flight.record.seed === 2")
+    until(browser, "episode.record.seed === 2")
 
 
 def test_fast_hands_break_nothing(browser: Chrome, host: str) -> None:
@@ -154,15 +154,15 @@ def test_fast_hands_break_nothing(browser: Chrome, host: str) -> None:
         press(browser, keys[i])
     press(browser, "r")
     visit(browser, host, seed=SEED, pilot="straight", t=0)
-    assert value(browser, "flight.record") == fly_again(value(browser, "flight.record"))
+    assert value(browser, "episode.record") == fly_again(value(browser, "episode.record"))
 
 
 def fly_again(record: dict) -> dict:
-    env = ForestEnv(World(), blind=True)
-    env.reset(seed=record["seed"])
+    drone = Drone(World())
+    drone.reset(record["seed"])
     for action in record["actions"]:
-        env.step(int(action))
-    return env.flight()
+        drone.step(int(action))
+    return drone.episode()
 
 
 def test_a_click_on_a_trunk_takes_it_out_of_the_decision(browser: Chrome, host: str) -> None:
@@ -174,11 +174,10 @@ def test_a_click_on_a_trunk_takes_it_out_of_the_decision(browser: Chrome, host: 
     circle = browser.find_elements(By.CSS_SELECTOR, "#trunks circle")[trunk]
     ActionChains(browser).move_to_element(circle).click().perform()
     until(browser, "removed")
-    steps = list(refly(SEED, value(browser, "flight.actions"), World()))
-    forest = np.delete(np.array(value(browser, "flight.trunks")), trunk, 0)
-    poses = np.array([info["pose"] for *_, info in steps[27:31]])
-    s = camera(poses, [forest] * 4, World())
-    q = load_weights(ROOT / "weights/paper.pt", 9, beacon=False, camera="grey")
+    poses = [drone.pose for _, drone in refly(value(browser, "episode.record"), World())]
+    forest = np.delete(np.array(value(browser, "episode.trunks")), trunk, 0)
+    s = camera(np.array(poses[27:31]), [forest] * 4, World())
+    q = load_weights(ROOT / "weights/dqn.pt")[0]
     with torch.no_grad():
         values = q(torch.from_numpy(s)[None])[0].tolist()
     assert value(browser, "removed.q") == pytest.approx(values, abs=1e-4)
@@ -199,7 +198,7 @@ def test_what_if_flies_both_ways(browser: Chrome, host: str) -> None:
     browser.find_elements(By.CSS_SELECTOR, "#bars button")[0].click()  # the sharpest left turn
     until(browser, "ghost")
     actions = value(browser, "ghost.actions")
-    assert actions[:25] == value(browser, "flight.actions")[:20] + "88888"
+    assert actions[:25] == value(browser, "episode.actions")[:20] + "88888"
     assert value(browser, "ghost.record") == fly_again(value(browser, "ghost.record"))
     assert len(value(browser, "ghost.moments")) == len(actions) + 1
 
@@ -207,7 +206,7 @@ def test_what_if_flies_both_ways(browser: Chrome, host: str) -> None:
 def test_escape_brings_the_plain_ghost_back(browser: Chrome, host: str) -> None:
     visit(browser, host, seed=SEED, actions="4444")
     value(browser, "whatIf(8)")
-    assert text(browser, "hint").startswith("The dashed way turns left (+.70 rad/s) at ")
+    assert text(browser, "hint").startswith("The dashed path turns left (+.70 rad/s) at ")
     press(browser, Keys.ESCAPE)
     assert value(browser, "ghost.label") == "network"
     assert "dashed" not in text(browser, "hint")
@@ -219,54 +218,56 @@ def test_escape_brings_the_plain_ghost_back(browser: Chrome, host: str) -> None:
 def saves(seed: int, actions: str, q: QNetwork) -> bool:
     """Whether the network crosses if it goes on after these actions; they may not crash."""
     rest, pilot = iter([[int(action)] for action in actions]), dqn_pilot(q)
-    (flight,) = fly(lambda fleet: next(rest, None) or pilot(fleet), [seed], World())
-    return flight["outcome"] == "goal" or flight["edge"] == "far"
+    (episode,) = fly(lambda s, envs: next(rest, None) or pilot(s, envs), [seed], World())
+    return episode["outcome"] in ("goal", "far")
 
 
 def test_it_went_wrong_at_the_last_moment_with_a_way_out(browser: Chrome, host: str) -> None:
-    q = load_weights(ROOT / "weights/paper.pt", 9, beacon=False, camera="grey")
-    visit(browser, host, seed=2, pilot="network", t=0)
-    actions, end = value(browser, "flight.actions"), value(browser, "end()")
+    q = load_weights(ROOT / "weights/dqn.pt")[0]
+    visit(browser, host, seed=SEED, pilot="straight", t=0)
+    actions, end = value(browser, "episode.actions"), value(browser, "end()")
     click(browser, "wrong")
-    until(browser, "ghost")
-    ways = [(end - 5 * i, turn) for i in range(1, 11) for turn in "840"]
-    t, turn = next((t, turn) for t, turn in ways if saves(2, actions[:t] + 5 * turn, q))
+    until(browser, "ghost && ghost.whole")
+    ways = [(end - 5 * i, turn) for i in range(1, 11) for turn in "840" if end >= 5 * i]
+    t, turn = next((t, turn) for t, turn in ways if saves(SEED, actions[:t] + 5 * turn, q))
     assert value(browser, "t") == t
     assert value(browser, "ghost.actions")[: t + 5] == actions[:t] + 5 * turn
     assert value(browser, "ghost.record") == fly_again(value(browser, "ghost.record"))
     assert value(browser, "crossed(ghost)") is True
     assert (
-        f"Of each half second, the last way out was at {t / 10} s. The dashed way turns left"
+        f"Of each half second, the last way out was at {t / 10} s. The dashed path turns left"
         in text(browser, "hint")
     )
 
 
-def test_a_flight_that_crossed_did_not_go_wrong(browser: Chrome, host: str) -> None:
-    visit(browser, host, seed=7, pilot="network", t=0)
+def test_an_episode_that_crossed_did_not_go_wrong(browser: Chrome, host: str) -> None:
+    q = load_weights(ROOT / "weights/dqn.pt")[0]
+    good = next(seed for seed in range(1, 50) if saves(seed, "", q))
+    visit(browser, host, seed=good, pilot="network", t=0)
     click(browser, "wrong")
     assert text(browser, "hint").startswith("Nothing went wrong: ")
     visit(browser, host, seed=7, actions="44")
     click(browser, "wrong")
-    assert text(browser, "hint").startswith("This flight is not over.")
+    assert text(browser, "hint").startswith("This episode is not over.")
 
 
 def test_where_nothing_saves_it_the_greatest_q_falls_most(browser: Chrome, host: str) -> None:
-    visit(browser, host, seed=2, pilot="network", t=0)
-    browser.execute_script("window.otherwise = async () => flight")  # each way ends as badly
-    best = np.max([moment["q"] for moment in value(browser, "flight.moments")[:-1]], 1)
+    visit(browser, host, seed=SEED, pilot="straight", t=0)
+    browser.execute_script("window.otherwise = async () => episode")  # each way ends as badly
+    best = np.max([moment["q"] for moment in value(browser, "episode.moments")[:-1]], 1)
     value(browser, "wentWrong()")
     assert value(browser, "t") == int(np.argmax(best[:-1] - best[1:]))
-    assert "only for weights learnt from rewards" in text(browser, "hint")
+    assert "the greatest Q falls most" in text(browser, "hint")
 
 
 def test_any_other_action_ends_the_search(browser: Chrome, host: str) -> None:
     for key in (Keys.SPACE, Keys.ESCAPE, ",", "w", Keys.ARROW_LEFT):
-        visit(browser, host, seed=2, pilot="network", t=20)
+        visit(browser, host, seed=SEED, pilot="straight", t=20)
         browser.execute_script("window.search = wentWrong()")
         assert text(browser, "hint").startswith("The network tries")
         press(browser, key)
         value(browser, "search")
-        assert value(browser, "[ghost, t < 40]") == [None, True]
+        assert value(browser, "ghost === plain")
         assert "way out" not in text(browser, "hint")
 
 
@@ -278,7 +279,7 @@ def test_the_line_on_top_is_about_the_last_action(browser: Chrome, host: str) ->
     press(browser, Keys.SPACE)
     assert text(browser, "hint").startswith("You have the controls")
     value(browser, "why(149)")
-    assert text(browser, "hint").startswith("That is in none of the four pictures")
+    assert text(browser, "hint").startswith("That is in none of the four frames")
     click(browser, "why")
     assert text(browser, "hint").startswith("You have the controls")
 
@@ -295,44 +296,44 @@ def test_a_bad_number_of_a_forest_is_refused_in_words(browser: Chrome, host: str
 
 def test_taking_over_keeps_the_way_so_far(browser: Chrome, host: str) -> None:
     visit(browser, host, seed=SEED, pilot="network", t=20)
-    before = value(browser, "flight.actions")
+    before = value(browser, "episode.actions")
     click(browser, "take")
     until(browser, "byHand() && end() === 20 && ghost")
     press(browser, ".")
     until(browser, "end() === 21")
-    assert value(browser, "flight.actions") == before[:20] + "4"
+    assert value(browser, "episode.actions") == before[:20] + "4"
 
 
 def test_taking_over_at_the_end_leaves_a_moment_to_fly(browser: Chrome, host: str) -> None:
     visit(browser, host, seed=SEED, pilot="network", t=1000)
-    before = value(browser, "flight.actions")
+    before = value(browser, "episode.actions")
     click(browser, "take")
     until(browser, "byHand() && ghost")
-    assert value(browser, "[flight.actions, over(), landed.size]") == [before[:-1], False, 0]
+    assert value(browser, "[episode.actions, over(), done.size]") == [before[:-1], False, 0]
 
 
-def test_the_address_restores_flight_and_moment(browser: Chrome, host: str) -> None:
+def test_the_address_restores_episode_and_moment(browser: Chrome, host: str) -> None:
     record = steered(browser, host)
     browser.execute_script("stepTo(7)")
     click(browser, "share")
     shared = browser.current_url
     visit(browser, host, world="beacon", seed=5)
     browser.get(shared)
-    until(browser, f"flight && ghost && flight.record.seed === {SEED}")
-    assert value(browser, "flight.record") == record
+    until(browser, f"episode && ghost && episode.record.seed === {SEED}")
+    assert value(browser, "episode.record") == record
     assert value(browser, "[t, chosen.pilot, chosen.world, chosen.weights]") == [
-        7, "you", "plain", "paper"
+        7, "you", "plain", "dqn"
     ]  # fmt: skip
 
 
-def test_a_bad_address_gets_a_line_and_a_flight(browser: Chrome, host: str) -> None:
+def test_a_bad_address_gets_a_line_and_an_episode(browser: Chrome, host: str) -> None:
     browser.get("about:blank")
     browser.get(f"http://{host}/#world=moon&weights=x&seed=-1&actions=99&t=-3.5")
-    until(browser, "flight && ghost")
+    until(browser, "episode && ghost")
     assert text(browser, "hint") == "The forest is a whole number of at most 18 digits."
     browser.get("about:blank")
     browser.get(f"http://{host}/#world=moon&weights=x&seed=1&actions=99&t=-3.5")
-    until(browser, "flight && ghost")
+    until(browser, "episode && ghost")
     assert text(browser, "hint").startswith("actions is '99'")
     refused = "400 (Bad Request)"  # the browser itself writes these
     assert all(refused in entry["message"] for entry in browser.get_log("browser"))
@@ -340,46 +341,62 @@ def test_a_bad_address_gets_a_line_and_a_flight(browser: Chrome, host: str) -> N
 
 def saved(browser: Chrome) -> Path:
     """What a click on Save writes."""
-    file = browser.downloads / "flights.json"
+    file = browser.downloads / "episodes.json"
     file.unlink(missing_ok=True)
     click(browser, "save")
     WebDriverWait(browser, 30).until(lambda _: file.exists())
     return file
 
 
-def test_saved_flights_train(browser: Chrome, host: str) -> None:
+def demonstrated(browser: Chrome) -> list[tuple[int, str]]:
+    """Seeds and actions of the episodes that a click on Save writes, as a training reads them."""
+    demos = read_demos(DemoConfig(demos=str(saved(browser)), demo_pilot="you"))
+    return [(episode["seed"], episode["actions"]) for episode in demos]
+
+
+def test_saved_episodes_are_whole_and_a_training_reads_them(browser: Chrome, host: str) -> None:
     record = steered(browser, host)
-    file = saved(browser)
-    (flown,) = read_flights(file, False)
-    assert (flown["seed"], flown["actions"]) == (record["seed"], record["actions"])
-    report = json.loads(file.read_text())
-    assert report["program"] == "Deep Flight"
-    assert math.isclose(report["pilots"]["you"]["flights"][-1]["return"], record["return"])
+    assert demonstrated(browser) == [(SEED, record["actions"])]
+    assert "demonstrations train --demos FILE --demo-pilot you" in text(browser, "hint")
+    pilots = {"you": {"episodes": [record]}}
+    assert json.loads(saved(browser).read_text()) == {
+        "beacon": False, "camera": "grey", "pilots": pilots
+    }  # fmt: skip
 
 
-def test_a_reload_keeps_every_flight_by_hand(browser: Chrome, host: str) -> None:
+def test_a_reload_keeps_every_episode_by_hand(browser: Chrome, host: str) -> None:
     record = steered(browser, host)
     visit(browser, host, seed=SEED + 1, pilot="network", t=0)
-    assert [flown["actions"] for flown in read_flights(saved(browser), False)] == [
-        record["actions"]
-    ]
+    assert demonstrated(browser) == [(SEED, record["actions"])]
 
 
-def test_a_flight_by_hand_that_comes_back_is_saved_once(browser: Chrome, host: str) -> None:
+def test_an_episode_by_hand_that_comes_back_is_saved_once(browser: Chrome, host: str) -> None:
     record = steered(browser, host)
-    shared = {"seed": SEED, "actions": record["actions"], "t": 3}
-    visit(browser, host, **shared)
-    assert [flown["actions"] for flown in read_flights(saved(browser), False)] == [
-        record["actions"]
-    ]
-    value(browser, "choose({}, flight.actions)")
-    assert len(read_flights(saved(browser), False)) == 1
+    visit(browser, host, seed=SEED, actions=record["actions"], t=3)
+    assert demonstrated(browser) == [(SEED, record["actions"])]
+    value(browser, "choose({}, episode.actions)")
+    assert len(demonstrated(browser)) == 1
     value(browser, "choose({ seed: '2000000000', pilot: 'straight' })")
-    value(browser, "choose({ pilot: 'you' }, flight.actions)")
+    value(browser, "choose({ pilot: 'you' }, episode.actions)")
     value(browser, "choose({ world: 'beacon', weights: '' })")
     click(browser, "save")
-    assert text(browser, "hint").startswith("There is no flight to save.")
+    assert text(browser, "hint").startswith("There is no episode to save.")
     assert "Left out: " in text(browser, "hint")
+
+
+def test_only_what_was_learned_from_rewards_is_called_q(browser: Chrome, host: str) -> None:
+    label = "document.querySelector('#bars button').ariaLabel"
+    visit(browser, host, seed=SEED, pilot="network", t=0)
+    assert ": Q " in value(browser, label)
+    assert "Q: the return" in browser.find_element(By.ID, "mind").text
+    visit(browser, host, seed=SEED, pilot="network", weights="imitation", t=0)
+    click(browser, "why")
+    until(browser, "reasons")
+    assert ": score " in value(browser, label)
+    page = browser.find_element(By.TAG_NAME, "main").text
+    assert "Scores: what the expert" in page
+    assert "mean score" in page
+    assert " Q" not in page
 
 
 @pytest.mark.parametrize("width", [390, 1280])

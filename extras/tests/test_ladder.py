@@ -1,67 +1,87 @@
-"""The ladder's flags lead from the textbook to the recipe; a curve stands within its own band."""
+"""The flags lead from the textbook to the recipe; committed trainings had these settings."""
 
 import json
-import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 
-from deepflight import PRESETS, SETTINGS, RunConfig, configure, parse
-from dqn import DQNConfig
-from extras.experiments import compare
-from extras.experiments.ladder import CONTROLS, RUNGS, trainings
+import deepflight
+from deepflight import Config
+from extras.experiments import demonstrations, ladder
+from extras.experiments.ladder import RECIPE, ROOT, RUNGS, Training
+from extras.lessons.expert import DemoConfig, ExpertConfig
+from extras.lessons.mnih import MnihConfig, TextbookConfig
 
-ROOT = Path(__file__).parents[2]
+CONFIGS = {
+    RECIPE: Config,
+    ladder.MNIH: MnihConfig,
+    (*ladder.MNIH, "textbook"): TextbookConfig,
+    demonstrations.EXPERT: ExpertConfig,
+    demonstrations.DEMOS: DemoConfig,
+}
 
 
-def settings(flags: list[str]) -> dict[str, object]:
-    """What `train` makes of these flags."""
-    args = parse(["train", *flags])
-    given = {f.name: vars(args)[f.name] for f in SETTINGS if f.name in args}
-    c, r = configure(PRESETS[args.preset or "default"] | given)
-    return asdict(c) | asdict(r)
+def settings(training: Training) -> Config:
+    """What `train` makes of a training's flags."""
+    config = CONFIGS[training.program]
+    given = vars(deepflight.parse(["train", *training.flags], config))
+    given = {key: value for key, value in given.items() if hasattr(config, key)}
+    return config(**given, seed=training.seed)
 
 
 def test_the_last_rung_is_the_recipe_and_each_rung_changes_what_it_names() -> None:
-    rungs = {label: settings(flags) for _, label, _, flags in trainings() if label in RUNGS}
-    *_, last = rungs.values()
-    assert last == asdict(DQNConfig()) | asdict(RunConfig()) | {"steps": 100_000}
-    for (lower, higher), more in zip(
-        zip(list(rungs.values())[:-1], list(rungs.values())[1:], strict=True),
-        list(RUNGS.values())[1:],
-        strict=True,
-    ):
-        changed = {key for key in higher if higher[key] != lower[key]}
+    rungs = [asdict(settings(x)) for x in ladder.trainings() if x.label in RUNGS and not x.seed]
+    assert rungs[-1] == asdict(Config(steps=100_000))
+    for lower, higher, more in zip(rungs, rungs[1:], [*RUNGS.values()][1:], strict=False):
         named = {word[2:].replace("-", "_") for word in more if word.startswith("--")}
-        assert changed == named
+        assert {key for key in higher if higher[key] != lower[key]} == named
 
 
-def test_each_training_of_the_ladder_has_a_folder_of_its_own_and_legal_settings() -> None:
-    names = [name for name, *_ in trainings()]
-    assert len(names) == len({*names}) == 1 + 2 * len(RUNGS) + 3 + len(CONTROLS) + 1
-    for *_, flags in trainings():
-        settings(flags)
-
-
-def test_a_committed_training_stands_within_its_own_band(
-    tmp_path: Path, capsys: pytest.CaptureFixture
+@pytest.mark.parametrize("experiment", [ladder, demonstrations])
+def test_each_training_has_a_folder_of_its_own_and_the_committed_ones_these_settings(
+    experiment: object,
 ) -> None:
-    shutil.copytree(ROOT / "results/scratch", tmp_path / "run")
-    assert compare.main([str(tmp_path / "run")]) == 0
-    assert capsys.readouterr().out.count(", within ") == len(compare.PANELS)
-    assert (tmp_path / "run/compare.png").stat().st_size > 10_000
-    assert compare.main([str(tmp_path / "run")]) == 0, "its own picture may be replaced"
+    trainings = list(experiment.trainings())
+    assert len({training.name for training in trainings}) == len(trainings)
+    for training in trainings:
+        c = settings(training)
+        if training.program != RECIPE or training.flags:
+            saved = json.loads((training.kept / "config.json").read_text())
+            assert type(c)(**saved) == replace(c, threads=saved["threads"]), training.name
+            assert saved.keys() == asdict(c).keys()
 
 
-def test_a_training_without_a_log_or_with_settings_that_no_seed_had_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture
+def test_an_interrupted_training_goes_on_and_a_finished_one_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert compare.main([str(tmp_path)]) == 2
-    assert "give a training's folder" in capsys.readouterr().err
-    shutil.copytree(ROOT / "results/scratch", tmp_path / "run")
-    config = tmp_path / "run/config.json"
-    config.write_text(json.dumps(json.loads(config.read_text()) | {"gamma": 0.5}))
-    assert compare.main([str(tmp_path / "run")]) == 2
-    assert "differs in ['gamma']" in capsys.readouterr().err
-    assert not (tmp_path / "run/compare.png").exists()
+    lines = []
+    monkeypatch.setattr(ladder, "ROOT", tmp_path)
+    monkeypatch.setattr(ladder.subprocess, "run", lambda line, **more: lines.append(line[1:]))
+    training = Training("ladder-x-1", "label", 1, ladder.MNIH, ("--steps", "800"))
+    train = ["-m", "extras.lessons.mnih", "train"]
+    begin = ["--name", "ladder-x-1", "--threads", "1", "--seed", "1", "--steps", "800"]
+    for passes, expected in (
+        (None, [*train, *begin]),
+        (50, [*train, "--resume", str(tmp_path / "runs/ladder-x-1")]),
+        (100, None),
+    ):
+        if passes:
+            training.folder.mkdir(parents=True, exist_ok=True)
+            content = {"config": {"steps": 800, "num_envs": 8}, "actions": [bytes(8)] * passes}
+            deepflight.save(training.folder / "checkpoint.pt", content)
+        lines.clear()
+        ladder.go_on(training)
+        assert lines == ([expected] if expected else [])
+
+
+def test_both_pictures_are_drawn_from_the_committed_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "results").symlink_to(ROOT / "results")
+    for experiment in (ladder, demonstrations):
+        monkeypatch.setattr(experiment, "ROOT", tmp_path)
+        experiment.draw()
+    for name in ("ladder", "demonstrations"):
+        assert (tmp_path / f"figures/{name}.png").stat().st_size > 10_000

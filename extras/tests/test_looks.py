@@ -8,7 +8,7 @@ import pytest
 import env
 from env import World, plant
 from extras.experiments.looks import LOOKS, STEREO, Look, draw_look, seeing, wear, wear_at_random
-from render import backdrop, camera
+from render import background, camera
 
 POSES = np.array([[0.0, 0.0, 0.0], [30.0, 3.0, 0.5], [70.0, -9.0, -2.0]])
 FORESTS = [plant(seed, World()) for seed in range(3)]
@@ -21,7 +21,7 @@ def test_the_plain_look_is_what_the_camera_draws(world: World) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in LOOKS if name != "plain"])
-def test_every_look_changes_a_grey_picture(name: str) -> None:
+def test_every_look_changes_a_grey_frame(name: str) -> None:
     seen = wear(LOOKS[name], POSES, FORESTS, GREY)
     assert (seen != camera(POSES, FORESTS, GREY)).mean() > 0.01
 
@@ -47,11 +47,11 @@ def test_every_stereo_error_changes_disparity_and_leaves_the_sky_above_most_trun
     assert (seen[:, 0] == 0).mean() > 0.3
 
 
-def test_rings_stand_on_bark_alone() -> None:
+def test_rings_stand_on_trunks_alone() -> None:
     seen, plain = wear(LOOKS["striped bark"], POSES, FORESTS, GREY), camera(POSES, FORESTS, GREY)
-    bark = camera(POSES, FORESTS, DEPTH) > backdrop(DEPTH)
-    assert (seen == plain)[~bark].all()
-    assert 0.2 < (seen != plain)[bark].mean() < 0.8
+    trunk = camera(POSES, FORESTS, DEPTH) > background(DEPTH)
+    assert (seen == plain)[~trunk].all()
+    assert 0.2 < (seen != plain)[trunk].mean() < 0.8
 
 
 def test_a_whole_step_of_disparity_is_a_multiple_of_its_levels() -> None:
@@ -64,7 +64,7 @@ def test_holes_are_inside_trunks_and_a_filled_one_has_a_depth() -> None:
     open_, filled = (wear(STEREO[n], POSES, FORESTS, DEPTH) for n in ("holes", "holes, filled"))
     hole = (open_ == 0) & (plain > 0)
     assert hole.any()
-    assert (plain > backdrop(DEPTH))[hole].all()
+    assert (plain > background(DEPTH))[hole].all()
     assert (filled[hole] > 0).all()
 
 

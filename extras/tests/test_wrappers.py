@@ -23,8 +23,8 @@ from env import OUTCOMES
 from extras.bridges.gym_env import ID
 
 
-def flight(env: gymnasium.Env, seed: int) -> tuple[list[ndarray], list[float], dict]:
-    """What the plain environment gives on a way straight ahead: pictures, rewards, last info."""
+def episode(env: gymnasium.Env, seed: int) -> tuple[list[ndarray], list[float], dict]:
+    """What the plain environment gives straight ahead: observations, rewards, last info."""
     seen, rewards, over = [env.reset(seed=seed)[0]], [], False
     while not over:
         observation, r, terminated, truncated, info = env.step(4)
@@ -42,10 +42,10 @@ def test_numpy_to_torch_gives_the_same_numbers_and_takes_a_tensor_as_action() ->
 
 
 def test_time_aware_observation_counts_the_steps() -> None:
-    plain = flight(gymnasium.make(ID), 1)[0]
+    plain = episode(gymnasium.make(ID), 1)[0]
     env = TimeAwareObservation(gymnasium.make(ID), flatten=False)
     assert env.observation_space["time"].high == 1000
-    seen = flight(env, 1)[0]
+    seen = episode(env, 1)[0]
     assert [int(each["time"][0]) for each in seen] == list(range(len(plain)))
     assert np.array_equal([each["obs"] for each in seen], plain)
     flat = TimeAwareObservation(gymnasium.make(ID)).reset(seed=1)[0]
@@ -53,15 +53,15 @@ def test_time_aware_observation_counts_the_steps() -> None:
 
 
 def test_record_episode_statistics_adds_up_the_rewards() -> None:
-    rewards = flight(gymnasium.make(ID), 1)[1]
-    counted = flight(RecordEpisodeStatistics(gymnasium.make(ID)), 1)[2]["episode"]
+    rewards = episode(gymnasium.make(ID), 1)[1]
+    counted = episode(RecordEpisodeStatistics(gymnasium.make(ID)), 1)[2]["episode"]
     assert counted["r"] == pytest.approx(sum(rewards)) and counted["l"] == len(rewards)
 
 
 def test_frame_stack_observation_holds_the_last_three_observations() -> None:
-    plain = flight(gymnasium.make(ID), 1)[0]
+    plain = episode(gymnasium.make(ID), 1)[0]
     env = FrameStackObservation(gymnasium.make(ID), 3)
-    seen = flight(env, 1)[0]
+    seen = episode(env, 1)[0]
     padded = [plain[0], plain[0], *plain]
     assert env.observation_space.shape == (3, 4, 84, 84)
     assert np.array_equal(seen, [padded[t : t + 3] for t in range(len(plain))])
@@ -75,7 +75,7 @@ def test_record_video_films_every_step_at_the_worlds_pace(
 ) -> None:
     folder, plain = tmp_path / "film", gymnasium.make(ID, render_mode="rgb_array", **world)
     env = RecordVideo(plain, str(folder))
-    steps = len(flight(env, 1)[1])
+    steps = len(episode(env, 1)[1])
     env.close()
     plain.reset(seed=1)
     file = str(next(folder.glob("*.mp4")))
@@ -91,7 +91,7 @@ def test_a_monitor_notes_outcome_and_progress_under_any_time_limit(
 ) -> None:
     env = TimeLimit(gymnasium.make(ID), limit)
     env = Monitor(env, str(tmp_path / "log"), info_keywords=("outcome", "progress"))
-    _, rewards, info = flight(env, 1)
+    _, rewards, info = episode(env, 1)
     env.close()
     (row,) = csv.DictReader((tmp_path / "log.monitor.csv").read_text().splitlines()[1:])
     assert float(row["r"]) == pytest.approx(sum(rewards)) and int(row["l"]) == len(rewards)

@@ -1,0 +1,192 @@
+"""What the cockpit answers: episodes, what the network thinks of them, and why.
+
+An answer is a function of the request alone. A request is a dictionary of texts. Its world,
+weights, seed and actions say which episode is meant, because seed and actions are all it takes to
+fly one again. The last few episodes stay in memory, so that the next step costs one step.
+
+Legend
+    A  actions
+    N  trunks
+    K  those of them that may be in view
+    R  observations of one moment: as it was, without each of K trunks, and without the goal's pole
+
+Not in this file: HTTP, which is in __main__.py, and the rules of the world, which are env.py's.
+"""
+
+import re
+from base64 import b64encode
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy import ndarray
+
+from deepflight import TRAIN_END, Config, load_weights
+from dqn import InputError, QNetwork
+from env import STACK, Pilot, VecForest, World, random_pilot, straight_pilot
+from extras.lessons.expert import laser_pilot
+from render import BEARINGS, camera, seen_from
+
+ROOT = Path(__file__).parents[2]
+WORLDS = {"plain": World(), "beacon": World(beacon=True), "disparity": World(camera="disparity")}
+
+
+class Recording(VecForest):
+    """One drone, one episode, and every moment since the start: what the drone saw, and what the
+    network thought. It is a vector environment, because that is what pilots fly."""
+
+    def __init__(self, q: QNetwork, world: World, seed: int) -> None:
+        super().__init__(world, 1, [seed])
+        self.reset_done()
+        self.q, self.drone, self.moments = q, self.drones[0], []
+        self.note(0.0)
+
+    def fly(self, action: int) -> None:
+        """One control step."""
+        self.note(float(self.step([action])[1][0]))
+
+    def note(self, r: float) -> None:
+        """Keep all that there is to show of the moment after a step of reward r."""
+        drone, s = self.drone, self.drone.observation  # (4, 84, 84)
+        moment = {"pose": drone.pose, "d_obs": drone.d_obs, "reward": r, "return": drone.total}
+        moment |= {"q": self.q(torch.from_numpy(s[None]))[0].tolist()}  # A numbers
+        self.moments.append(moment | {"frame": b64encode(s[-1]).decode()})
+
+
+def repeatable_random(s: ndarray, envs: Recording) -> ndarray:
+    """A random action, but the same one each time that this moment is asked for."""
+    return random_pilot(np.random.default_rng([envs.drone.seed, len(envs.moments)]))(s, envs)
+
+
+PILOTS: dict[str, Pilot] = {"network": lambda s, envs: [int(np.argmax(envs.moments[-1]["q"]))]}
+PILOTS |= {"laser": laser_pilot(Config.gamma), "random": repeatable_random}
+PILOTS |= {"straight": straight_pilot}
+
+# What may be asked, as patterns.
+LEGAL = dict.fromkeys(("more", "since", "time"), "[0-9]{1,4}")
+LEGAL |= {"world": "|".join(WORLDS), "pilot": "|".join(PILOTS), "seed": "[0-9]{1,18}"}
+LEGAL |= {"weights": ".{1,300}", "actions": f"[0-{World.actions - 1}]{{0,{World.max_steps}}}"}
+
+
+def check(ask: Any, keys: str) -> None:
+    """Raise ValueError unless a request has just these keys, each with a legal text."""
+    if not isinstance(ask, dict) or ask.keys() != {*keys.split()}:
+        raise ValueError(f"a request is an object with these keys alone: {keys or 'none'}")
+    for key, value in ask.items():
+        if not isinstance(value, str) or not re.fullmatch(LEGAL[key], value):
+            raise ValueError(f"{key} is {str(value)[:40]!r}, allowed is a text like {LEGAL[key]}")
+
+
+@cache
+def read_network(path: Path, _changed: int) -> tuple[QNetwork, World, str]:
+    """A network, its world, and the name of its pilot; InputError if it is no weights file.
+    _changed: when the file was written, because a training writes it again."""
+    q, world, pilot = load_weights(path)
+    return q.requires_grad_(False), world, pilot
+
+
+class Hangar:
+    """The networks in two folders, and the last episodes. One thread at a time may ask it."""
+
+    def __init__(self, root: Path = ROOT) -> None:
+        torch.set_num_threads(1)  # more gain nothing on so few frames
+        self.root, self.recordings = root, []
+
+    def networks(self, world: str) -> dict[str, tuple[QNetwork, str]]:
+        """Those of this world and their pilots' names, from weights/*.pt and runs/*/best.pt."""
+        paths = {path.stem: path for path in self.root.glob("weights/*.pt")}
+        paths |= {f"runs/{path.parent.name}": path for path in self.root.glob("runs/*/best.pt")}
+        found = {}
+        for name, path in sorted(paths.items()):
+            with suppress(InputError):
+                q, home, pilot = read_network(path, path.stat().st_mtime_ns)
+                found |= {name: (q, pilot)} if home == WORLDS[world] else {}
+        return found
+
+    def find(self, ask: dict[str, str]) -> Recording:
+        """The episode of a request. It goes on with the one in memory that shares most of its
+        actions. ValueError if there are no such weights, or if the episode ends sooner."""
+        q, _ = self.networks(ask["world"]).get(ask["weights"], (None, ""))
+        if q is None:
+            raise ValueError(f"there are no weights {ask['weights']!r} of world {ask['world']}")
+        seed, actions = int(ask["seed"]), [int(action) for action in ask["actions"]]
+        same = [x for x in self.recordings if (x.q, x.drone.seed) == (q, seed)]
+        begun = [x for x in same if x.drone.actions == actions[: len(x.drone.actions)]]
+        recording = max(begun, key=lambda x: len(x.moments), default=None)
+        recording = recording or Recording(q, WORLDS[ask["world"]], seed)
+        for action in actions[len(recording.drone.actions) :]:
+            if recording.drone.outcome:
+                raise ValueError(f"the episode ends after {len(recording.moments) - 1} actions")
+            recording.fly(action)
+        # The last eight, of 10 MB each at most.
+        self.recordings = [recording, *(x for x in self.recordings if x is not recording)][:8]
+        return recording
+
+    def options(self, ask: Any) -> dict[str, Any]:
+        """What one may choose from, and the numbers of each world that the page draws with.
+        half_view: rad, from ahead to the left edge of a frame."""
+        check(ask, "")
+        worlds = {}
+        for name, world in WORLDS.items():
+            weights = {x: pilot for x, (_, pilot) in self.networks(name).items()}
+            worlds[name] = vars(world) | {"weights": weights}
+        return {"worlds": worlds, "pilots": ["you", *PILOTS], "half_view": float(BEARINGS[0]),
+                "train_end": TRAIN_END}  # fmt: skip
+
+    def fly(self, ask: Any) -> dict[str, Any]:
+        """Fly the actions, then let the pilot fly `more` steps, or to the end. Returns the record
+        as `eval --json` writes it, the trunks, and the moments from `since`."""
+        check(ask, "world weights seed actions pilot more since")
+        recording, pilot = self.find(ask), PILOTS[ask["pilot"]]
+        for _ in range(int(ask["more"])):
+            if recording.drone.outcome:
+                break
+            recording.fly(int(pilot(recording.drone.observation[None], recording)[0]))
+        drone, moments = recording.drone, recording.moments[int(ask["since"]) :]
+        return {"record": drone.episode(), "trunks": drone.trunks.tolist(), "moments": moments}
+
+    def why(self, ask: Any) -> dict[str, Any]:
+        """What each thing in view does to the decision at moment `time`: Q with and without it.
+
+        `weight` says how much of the chosen action's advantage hangs on it: its Q less the mean of
+        all Q. Trunk -1 is the goal's pole. A trunk that changes no pixel is left out.
+        """
+        check(ask, "world weights seed actions time")
+        recording, t = self.find(ask), int(ask["time"])
+        if t >= len(recording.moments):
+            raise ValueError(f"time is {t}, and the episode has {len(recording.moments) - 1} steps")
+        last = [recording.moments[max(t - k, 0)]["pose"] for k in reversed(range(STACK))]
+        names, s = without(np.array(last), recording)  # (R,), (R, 4, 84, 84)
+        changed = np.flatnonzero((s != s[0]).any((1, 2, 3)))  # of R: what is in view
+        before, *after = recording.q(torch.from_numpy(s[[0, *changed]])).tolist()
+        chosen = int(np.argmax(before))
+        advantage, *rest = [q[chosen] - float(np.mean(q)) for q in (before, *after)]
+        reasons = [
+            {"trunk": int(names[i]), "q": q, "weight": advantage - other,
+             "frame": b64encode(s[i, -1]).decode()}
+            for i, q, other in zip(changed, after, rest, strict=True)
+        ]  # fmt: skip
+        return {"before": before, "chosen": chosen, "without": reasons}
+
+
+def without(poses: ndarray, recording: Recording) -> tuple[list[int], ndarray]:
+    """The observation as it is, and with each thing taken out that may be in view.
+
+    poses (4, 3): where the four frames were taken. Returns names and observations (R, 4, 84, 84).
+    The names: -2 is nothing, -1 the goal's pole, others are numbers of trunks.
+    """
+    trunks, world = recording.drone.trunks, recording.world
+    ahead, left = np.stack([seen_from(pose, trunks) for pose in poses]).T  # (N, 4), (N, 4) m
+    # As `camera` does it: two radii to spare, because a trunk is wide.
+    inside = (ahead > 0) & (ahead < world.view) & (abs(left) < ahead + 2 * world.trunk_radius)
+    near = np.flatnonzero(inside.any(1))  # (K,)
+    forests = [trunks, *(np.delete(trunks, i, 0) for i in near)]  # 1 + K of (N, 2), (N - 1, 2) m
+    goal = (world.length, 0) if world.beacon else None
+    # (4 + 4 K, 3), and as many forests: one for each camera
+    cameras, seen = np.tile(poses, (len(forests), 1)), [f for f in forests for _ in poses]
+    # In a world without a pole the last observation equals the first, and so is left out.
+    frames = [camera(cameras, seen, world, goal), camera(poses, [trunks] * STACK, world)]
+    return [-2, *near, -1], np.concatenate(frames).reshape(-1, *recording.drone.observation.shape)

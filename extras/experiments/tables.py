@@ -1,0 +1,74 @@
+"""tables.py: print the tables of README.md and results/README.md from the files in results/.
+
+    .venv/bin/python -m extras.experiments.tables
+
+tests/test_readme.py compares what this prints with what stands in the two pages.
+"""
+
+import io
+import json
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import deepflight
+
+ROOT = Path(__file__).resolve().parents[2]
+LABELS = {
+    "goal": "arrived, %", "crossed": "crossed, %", "crash": "crashed, %",
+    "longer": "longer than random, %", "return": "return",
+}  # fmt: skip
+FRONT = {  # heading -> file, pilot
+    "DQN": ("dqn", "dqn"),
+    "DQN, beacon": ("dqn-beacon", "dqn"),
+    "imitation": ("imitation", "imitation"),
+    "imitation, beacon": ("imitation-beacon", "imitation"),
+}
+FULL = FRONT | {
+    "imitation, disparity": ("imitation-disparity", "imitation"),
+    "laser": ("imitation", "laser"),
+}
+SEEDS = {f"seed {i}": (name, "dqn") for i, name in enumerate(("dqn", "dqn-1", "dqn-2"))}
+
+
+def read(name: str) -> dict[str, Any]:
+    """A file that `eval --json` wrote."""
+    return json.loads((ROOT / "results" / f"{name}.json").read_text())
+
+
+def metric(pilot: dict[str, Any], key: str) -> str:
+    """A metric with its interval, as in 69.1 [66.2, 71.9]."""
+    factor, digits = (1, 1) if key == "return" else (100, 0 if key == "longer" else 1)
+    value, low, high = (f"{factor * x:z.{digits}f}" for x in pilot[key].values())
+    return f"{value} [{low}, {high}]"
+
+
+def markdown(columns: dict[str, tuple[str, str]]) -> str:
+    """A table in Markdown: one row a metric, one column a pilot."""
+    pilots = [read(file)["pilots"][pilot] for file, pilot in columns.values()]
+    lines = ["| | " + " | ".join(columns) + " |", "|" + "---|" * (len(columns) + 1)]
+    for key, label in LABELS.items():
+        lines.append(f"| {label} | " + " | ".join(metric(pilot, key) for pilot in pilots) + " |")
+    return "\n".join(lines)
+
+
+def front() -> str:
+    """What `eval` prints, from results/eval.json."""
+    report, out = read("eval"), io.StringIO()
+    with redirect_stdout(out):
+        print(f"{report['forests']} forests from seed {report['first_seed']}; ", end="")
+        print("95 % intervals in [ ]\n")
+        deepflight.print_table(report["pilots"])
+    return out.getvalue().rstrip()
+
+
+def outcomes(file: str, pilot: str) -> str:
+    """How the episodes of a pilot ended."""
+    ended = [episode["outcome"] for episode in read(file)["pilots"][pilot]["episodes"]]
+    return ", ".join(f"{ended.count(outcome)} {outcome}" for outcome in deepflight.env.OUTCOMES)
+
+
+if __name__ == "__main__":
+    print(front(), markdown(FRONT), markdown(FULL), markdown(SEEDS), sep="\n\n")
+    for name in FULL.values():
+        print(*name, outcomes(*name))

@@ -1,0 +1,380 @@
+"""The planner against a loop of single steps, losses by hand, interrupted trainings."""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, fields, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import deepflight
+import dqn
+from deepflight import Config, Run
+from dqn import InputError
+from env import Drone, VecForest, World, fly, random_pilot, reward
+from extras.lessons import expert
+from extras.lessons.expert import DemoConfig, ExpertBatch, ExpertConfig, ExpertReplay, plan, scan
+
+WORLD = World()
+CLEARING = replace(WORLD, rows=0)  # no trunks
+ARRIVAL = Config(forward_reward=0.0, goal_bonus=125.0, far_bonus=0.0)
+# A training small enough to be done often: its replay wraps at step 160.
+SMALL = dict(learning_starts=80, replay_size=160, update_every=16, batch_size=8, target_every=64)
+
+
+def placed(world: World, *pose: float, seed: int = 0) -> Drone:
+    """A drone at this pose."""
+    drone = Drone(world)
+    drone.reset(seed)
+    drone.pose = pose
+    return drone
+
+
+# -------------------------------------------------- the laser and the planner
+
+
+def test_the_nearest_beam_agrees_with_d_obs() -> None:
+    drone, rng = Drone(WORLD), np.random.default_rng(0)
+    for seed in range(10):
+        drone.reset(seed)
+        while not drone.outcome:
+            assert scan(drone)[1].min() == pytest.approx(drone.d_obs, abs=0.05)
+            drone.step(int(rng.integers(9)))
+
+
+def test_the_scan_starts_straight_ahead_and_goes_counter_clockwise() -> None:
+    drone = placed(WORLD, 0.0, 0.0, 0.0)
+    drone.trunks = np.array([[0.0, 5.0]])
+    bearings, distance = scan(drone)
+    assert bearings[distance.argmin()] == pytest.approx(math.pi / 2)
+    assert distance.min() == pytest.approx(4.5)
+    assert distance[0] == 20.0
+
+
+def one_after_another(scanned: Sequence, pose: Sequence, w: World, c: Config) -> list[float]:
+    """What `plan` should say."""
+    surface = [(d * math.cos(b), d * math.sin(b)) for b, d in zip(*scanned, strict=True)]
+    surface = [p for p, d in zip(surface, scanned[1], strict=True) if d < w.laser_range]
+    rates = [w.yaw_rate * (2 * a / (w.actions - 1) - 1) for a in range(w.actions)]
+    steps = [max(round(seconds / w.dt), 1) for seconds in (0.6, 1.6)]
+    values = [[] for _ in rates]
+    for first, then in product(range(w.actions), repeat=2):
+        (x, y, heading), ahead, left, turned, value = pose, 0.0, 0.0, 0.0, 0.0
+        for k, rate in enumerate([rates[first]] * steps[0] + [rates[then]] * steps[1]):
+            turned += rate * w.dt
+            ahead += w.speed * w.dt * math.cos(turned)
+            left += w.speed * w.dt * math.sin(turned)
+            px = x + ahead * math.cos(heading) - left * math.sin(heading)
+            py = y + ahead * math.sin(heading) + left * math.cos(heading)
+            d_obs = min([math.dist((ahead, left), point) for point in surface] + [w.laser_range])
+            d_goal, crash = math.dist((px, py), (w.length, 0)), d_obs < w.d_crash + 0.1
+            goal = not crash and d_goal < w.goal_radius
+            far = not crash and not goal and px > w.length
+            out = not goal and (px < -w.back or abs(py) > w.width / 2)
+            lost = crash or far or out
+            value += c.gamma**k * reward("crash" if lost else "", d_obs, d_goal, w)
+            value += c.gamma**k * c.forward_reward * w.speed * w.dt * math.cos(heading + turned)
+            if lost or goal:
+                break
+        ends = []
+        for bearing, metres, bonus in (
+            (math.atan2(-py, w.length - px), d_goal, c.goal_bonus),
+            (0.0, w.length - px, c.far_bonus),
+        ):
+            turn = abs(math.remainder(bearing - heading - turned, math.tau))
+            ends.append(bonus * c.gamma ** ((turn / w.yaw_rate + metres / w.speed) / w.dt))
+        more = c.goal_bonus if goal else c.far_bonus if far else 0 if lost else max(ends)
+        values[first].append(value + c.gamma ** (k + 1) * more)
+    return [max(some) for some in values]
+
+
+@pytest.mark.parametrize("seed", range(15))
+def test_the_planner_adds_up_the_rewards_to_come_in_any_world(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(expert, "BEAMS", 60)
+    rng = np.random.default_rng(seed)
+    world = World(
+        length=rng.uniform(8, 60), width=rng.uniform(8, 40), back=rng.uniform(0, 3),
+        speed=rng.uniform(2, 7), dt=rng.uniform(0.05, 0.15), yaw_rate=rng.uniform(0.3, 1.5),
+        actions=int(rng.integers(2, 6)), laser_range=rng.uniform(3, 15), d_crash=0.6, d_neg=2.5,
+        r_safe=rng.uniform(0, 1), r_precrash=-rng.uniform(1, 9), r_crash=-rng.uniform(5, 50),
+        goal_radius=rng.uniform(0.5, 4), rows=3, columns=3, first_y=-6.0,
+    )  # fmt: skip
+    for _ in range(5):
+        x, y = rng.random(2) * (world.length, world.width) - (0, world.width / 2)
+        drone, (goal, far) = placed(world, x, y, rng.uniform(-4, 4)), rng.uniform(0, 200, 2)
+        c = Config(gamma=rng.uniform(0.8, 0.999), forward_reward=rng.uniform(0, 3),
+                   goal_bonus=goal, far_bonus=far)  # fmt: skip
+        where = scan(drone), drone.pose, world, c
+        assert plan(*scan(drone), *where[1:]) == pytest.approx(one_after_another(*where))
+
+
+def test_the_header_s_number_and_the_turn_to_the_goal() -> None:
+    drone = placed(CLEARING, 0.0, 0.0, 0.0)
+    assert plan(*scan(drone), drone.pose, CLEARING, ARRIVAL).max() == pytest.approx(26.7, abs=0.05)
+    for heading, action in ((0.0, 4), (-2.0, 8), (2.0, 0)):
+        drone = placed(CLEARING, 45.0, 0.0, heading)
+        assert plan(*scan(drone), drone.pose, CLEARING, ARRIVAL).argmax() == action
+
+
+def test_the_planner_turns_away_from_a_trunk_ahead() -> None:
+    drone = placed(WORLD, 0.0, 0.0, 0.0)
+    for left in (0.3, -0.3):
+        drone.trunks = np.array([[6.0, left]])
+        assert (plan(*scan(drone), drone.pose, WORLD, ARRIVAL).argmax() - 4) * left < 0
+
+
+def test_the_candidates_reach_2_2_s_ahead_at_any_control_rate() -> None:
+    for rate in (10, 30, 50):
+        at, headings = expert.trajectories(World(dt=1 / rate))
+        assert at.shape == headings.shape == (81, round(2.2 * rate))
+        assert headings[0, -1] == pytest.approx(-0.7 * 2.2)
+        assert at[40, -1] == pytest.approx(11.0)
+
+
+def test_the_laser_pilot_arrives_and_never_crashes() -> None:
+    first = deepflight.TEST_FIRST
+    episodes = fly(expert.laser_pilot(0.99), range(first, first + 20), WORLD, blind=True)
+    assert not any(e["outcome"] == "crash" for e in episodes)
+    assert sum(e["outcome"] == "goal" for e in episodes) >= 18
+    assert sum(e["return"] for e in episodes) / 20 > 70
+
+
+# -------------------------------------------------- settings
+
+
+def test_the_two_recipes_differ_from_dqn_s_in_what_their_comments_say() -> None:
+    own, base = {f.name for f in fields(DemoConfig)} - {*asdict(Config())}, asdict(Config())
+    for config, expected in (
+        (DemoConfig, {"epsilon_decay": 1}),
+        (ExpertConfig, dict(
+            learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000, lr_decay=0.0,
+            forward_reward=1.0, far_bonus=115.0,
+        )),
+    ):  # fmt: skip
+        found = {k: x for k, x in asdict(config()).items() if k not in own and x != base[k]}
+        assert found == expected
+    assert (ExpertConfig().imitation, ExpertConfig().bellman) == (True, False)
+    assert (DemoConfig().imitation, DemoConfig().bellman) == (False, True)
+    assert (ExpertConfig.pilot, ExpertConfig.validate_every) == ("imitation", 20_000)
+    with pytest.raises(InputError, match="nothing to learn from"):
+        ExpertConfig(imitation=False)
+
+
+# -------------------------------------------------- losses and batches
+
+
+def test_the_margin_loss_is_how_far_the_demonstrated_action_is_from_the_best_by_the_margin() -> (
+    None
+):
+    rng = np.random.default_rng(0)
+    q, a = rng.normal(0, 5, (500, 9)), rng.integers(9, size=500)
+    missed = []
+    for values, demonstrated in zip(q, a, strict=True):
+        others = max(x for i, x in enumerate(values) if i != demonstrated)
+        missed.append(max(others + 3.0 - values[demonstrated], 0))
+    loss = expert.margin_loss(torch.from_numpy(q), torch.from_numpy(a), 3.0)
+    assert loss.numpy() == pytest.approx(missed)
+    assert 0 < np.count_nonzero(missed) < 500
+
+
+def test_imitation_moves_advantages_to_those_of_the_scores_and_not_the_level() -> None:
+    scores = torch.tensor([[3.0, 1.0, -500.0], [70.0, 70.0, 70.0]])
+    q = torch.tensor([[10.0, 20.0, 60.0], [5.0, -5.0, 0.0]], requires_grad=True)
+    optimizer, level = torch.optim.SGD([q], 0.5), q.mean(1).tolist()
+    for _ in range(300):
+        optimizer.zero_grad()
+        expert.imitation_loss(q, scores, 10.0).backward()
+        optimizer.step()
+    assert q.mean(1).tolist() == pytest.approx(level, abs=1e-4)
+    assert (q[0] - q[0, 0]).tolist() == pytest.approx([0, -2, -20], abs=1e-3)  # 20 at most
+    assert (q[1] - q[1, 0]).tolist() == pytest.approx([0, 0, 0], abs=1e-3)
+
+
+def filled(envs: VecForest, reward: float, is_demo: bool = False) -> ExpertReplay:
+    """30 rows, whose frames, actions and scores tell the row; 2 environments."""
+    replay, none = ExpertReplay(80, envs, is_demo), np.zeros(2, bool)
+    for t in range(30):
+        envs.scores = np.arange(18).reshape(2, 9) + 100 * t
+        s = np.full((2, 4, 84, 84), t, np.uint8)
+        s[..., 0] = 255  # the left column, which a reflection moves
+        replay.add(s, np.full(2, t % 9), np.full(2, reward), s, none, none)
+    return replay
+
+
+def test_scores_come_back_with_their_observation_and_turn_round_with_it() -> None:
+    rng = np.random.default_rng(0)
+    b = filled(VecForest(WORLD, 2, []), 1.0).sample(200, 1, 0.9, rng)
+    t = b.s[:, 3, 0, 40].long()  # (B,)
+    assert (b.scores[:, 0] // 100 == t).all()
+    assert {*(b.scores[:, 0] % 100).tolist()} == {0, 9}, "of both environments"
+    twin = ExpertBatch(*(x.clone() for x in b))
+    expert.mirror(twin, 9, rng)
+    flipped = twin.s[:, 3, 0, 83] == 255  # (B,)
+    assert 60 < flipped.sum() < 140
+    for i in range(200):
+        scores, a = (b.scores[i].flip(0), 8 - b.a[i]) if flipped[i] else (b.scores[i], b.a[i])
+        assert torch.equal(twin.scores[i], scores)
+        assert twin.a[i] == a
+
+
+def test_a_share_of_each_batch_is_demonstrated_and_at_first_all_of_it() -> None:
+    envs, rng = VecForest(WORLD, 2, []), np.random.default_rng(0)
+    own, demos = filled(envs, 1.0), filled(envs, 2.0, is_demo=True)
+    c = DemoConfig(n_steps=1, demo_share=0.25)
+    for replay, demo_replay, n in ((own, None, 0), (own, demos, 8), (demos, None, 32)):
+        b = expert.sample(replay, demo_replay, c, rng)
+        assert len(b.r) == 32
+        assert b.is_demo.sum() == n
+        assert torch.equal(b.is_demo, b.r == 2)
+
+
+def test_the_loss_is_the_sum_of_what_the_settings_ask_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dqn, "BFLOAT16", False)
+    envs, rng = VecForest(WORLD, 2, []), np.random.default_rng(0)
+    b = filled(envs, 40.0, is_demo=True).sample(32, 2, 0.9, rng)
+    b.is_demo[:16] = False
+    for imitation, bellman in ((True, False), (False, True), (True, True)):
+        c = DemoConfig(imitation=imitation, bellman=bellman, margin=3.0)
+        agent = dqn.Agent(c, 9, rng)
+        with torch.no_grad():
+            q, q2, online = agent.q(b.s), agent.q_target(b.s2), agent.q(b.s2)
+        errors = dqn.td_target(b, q2, online) - q.gather(1, b.a[:, None])[:, 0]  # (B,)
+        assert (errors > 10).all(), "beyond huber_delta the loss is 10 * abs(error) - 50"
+        expected = 10 * expert.margin_loss(q, b.a, 3.0)[16:].sum() / 32
+        expected += bellman * (10 * errors - 50).mean()
+        expected += imitation * expert.imitation_loss(q, b.scores, 10.0)
+        expert.learn(agent, b, c)
+        assert agent.loss == pytest.approx(expected.item(), rel=1e-4)
+
+
+# -------------------------------------------------- trainings
+
+
+@pytest.fixture(autouse=True)
+def little_to_fly(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A validation is two episodes, and so is its baseline."""
+    few = partial(fly, random_pilot(np.random.default_rng(0)), blind=True)
+    monkeypatch.setattr(deepflight, "VALIDATION", range(10**9, 10**9 + 2))
+    monkeypatch.setattr(deepflight, "fly_random", few)
+    deepflight.random_steps.cache_clear()
+    yield
+    deepflight.random_steps.cache_clear()
+
+
+def finish(train: Callable, c: Config, folder: Path, cuts: Sequence[int] = ()) -> Run:
+    """A whole training, saved and resumed after each of these steps."""
+    folder.mkdir()
+    run = Run(train, c, folder)
+    for cut in cuts:
+        while run.envs.steps < cut:
+            next(run.loop)
+        run.save()
+        keys = "config", "actions", "forests", "agent", "optimizer", "rng", "log"
+        run = Run(train, c, folder, deepflight.load(folder / "checkpoint.pt", *keys))
+    assert run.go() == 0
+    return run
+
+
+def assert_same_training(one: Run, other: Run) -> None:
+    """Equal weights, optimizers, replays, random numbers and files."""
+    for a, b in ((one.agent, other.agent), (one.agent.optimizer, other.agent.optimizer)):
+        assert list(flat(a.state_dict())) == list(flat(b.state_dict()))
+    for name in ("frames", "actions", "rewards", "ends", "scores"):
+        if hasattr(one.replay, name):
+            assert np.array_equal(getattr(one.replay, name), getattr(other.replay, name)), name
+    assert one.rng.bit_generator.state == other.rng.bit_generator.state
+    best = ((run.folder / "best.pt").read_bytes() for run in (one, other))
+    assert len({*best}) == 1
+
+
+def flat(x: object) -> object:
+    """The numbers in nested dictionaries and lists, a tensor as its bytes."""
+    for value in x.values() if isinstance(x, dict) else x:
+        if isinstance(value, torch.Tensor):
+            yield value.numpy().tobytes()
+        elif isinstance(value, dict | list):
+            yield from flat(value)
+        else:
+            yield value
+
+
+@pytest.fixture
+def demos(tmp_path: Path) -> str:
+    """A file as eval --json writes it, two episodes of the laser pilot."""
+    episodes = fly(expert.laser_pilot(0.99), [0, 1], WORLD, blind=True)
+    path = tmp_path / "demos.json"
+    path.write_text(json.dumps({"pilots": {"random": {}, "laser": {"episodes": episodes}}}))
+    return str(path)
+
+
+def test_interrupted_is_uninterrupted_with_an_expert_demonstrations_and_disparity(
+    tmp_path: Path, demos: str
+) -> None:
+    c = ExpertConfig(**SMALL, steps=240, demo_updates=3, demos=demos, demo_share=0.25,
+                     camera="disparity", bellman=True)  # fmt: skip
+    whole = finish(expert.train, c, tmp_path / "whole")
+    cut = finish(expert.train, c, tmp_path / "cut", cuts=(8, 168, 208))
+    assert_same_training(whole, cut)
+    assert whole.replay.scores.any(2).all()
+    assert (whole.replay.frames[:, :, 0] == 0).mean() > 0.5, "the sky has no disparity"
+
+
+def test_where_q_would_explore_the_expert_flies(tmp_path: Path) -> None:
+    c = ExpertConfig(**SMALL, steps=160, epsilon_final=1.0)
+    run = finish(expert.train, c, tmp_path / "run")
+    for drone in run.envs.drones[:2]:
+        assert len(drone.actions) == 160 // 8
+        alone = VecForest(WORLD, 1, [drone.seed], blind=True)
+        alone.reset_done()
+        for a in drone.actions:
+            assert expert.expert_scores(alone, c)[0].argmax() == a
+            alone.step([a])
+
+
+def test_demonstrations_alone_come_before_all_else(tmp_path: Path, demos: str) -> None:
+    c = DemoConfig(**SMALL, steps=80, demos=demos, demo_updates=7)
+    run = finish(expert.train, c, tmp_path / "run")
+    updates = {state["step"].item() for state in run.agent.optimizer.state.values()}
+    assert updates == {8}, "7 before the first step, and one of step 80"
+    assert not run.replay.scores.any(), "nobody asks the expert"
+
+
+def test_updates_on_demonstrations_alone_sync_the_target_network_too(demos: str) -> None:
+    c, rng = DemoConfig(**SMALL, demos=demos, demo_updates=4), np.random.default_rng(0)
+    replay = expert.load_demos(expert.read_demos(c), c, WORLD, lambda r, drones: r)
+    assert replay.added == sum(len(episode["actions"]) for episode in expert.read_demos(c))
+    for updates, same in ((4, True), (3, False)):  # target_every is 64 steps, of 16 an update
+        agent = dqn.Agent(c, 9, rng)
+        expert.pretrain(agent, replay, replace(c, demo_updates=updates), rng)
+        pairs = zip(agent.q.parameters(), agent.q_target.parameters(), strict=True)
+        assert all(torch.equal(*pair) for pair in pairs) == same
+
+
+def test_bad_demonstrations_are_named(tmp_path: Path, demos: str) -> None:
+    with pytest.raises(InputError, match="no episodes of a pilot called me"):
+        expert.read_demos(DemoConfig(demos=demos, demo_pilot="me"))
+    episodes = expert.read_demos(DemoConfig(demos=demos))
+    wrong = [episodes[0] | {"outcome": "time"}]
+    with pytest.raises(InputError, match="end elsewhere"):
+        expert.load_demos(wrong, DemoConfig(), WORLD, lambda r, drones: r)
+    with pytest.raises(InputError, match="0 steps"):
+        expert.load_demos([], DemoConfig(), WORLD, lambda r, drones: r)
+
+
+def test_eval_prints_the_laser_pilot_beside_the_shipped_network(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = Path(deepflight.__file__).parent / "weights/imitation.pt"
+    words = ["expert", "eval", "--weights", str(shipped), "--episodes", "2", "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", words)
+    monkeypatch.setattr(deepflight.render, "save_film", lambda *film: None)
+    assert expert.main() == 0
+    head = capsys.readouterr().out.splitlines()[2].split()
+    assert head == ["random", "straight", "laser", "imitation"]
