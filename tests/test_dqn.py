@@ -27,8 +27,7 @@ def play(rows: int, num_envs: int, seed: int) -> list[list[tuple]]:
 
 
 def read(s: torch.Tensor) -> list[list[int]]:
-    """The numbers (B, 4) that frames (B, 4, 84, 84) show in their first two pixels."""
-    return (s[:, :, 0, 0].int() * 256 + s[:, :, 0, 1]).tolist()
+    return (s[:, :, 0, 0].int() * 256 + s[:, :, 0, 1]).tolist()  # what two pixels of a frame show
 
 
 def fill(histories: list[list[tuple]], capacity: int) -> Replay:
@@ -80,18 +79,7 @@ def test_samples_are_drawn_from_all_complete_windows_and_no_others() -> None:
     assert drawn == {*range(rows - kept + 3 + 1, rows - n + 1)}
 
 
-def test_a_transition_takes_7200_bytes_and_a_last_frame_goes_with_its_row() -> None:
-    replay, histories = Replay(8_000, 8), play(500, 2, 1)
-    arrays = replay.frames, replay.actions, replay.rewards, replay.ends
-    assert sum(x.nbytes for x in arrays) <= 8_000 * 7_200
-    kept = {(t % 25, i) for t in range(475, 500) for i in (0, 1) if histories[i][t][3] == TRUNCATED}
-    frames = fill(histories, 50).last_frames
-    assert frames.keys() == kept != set()
-    assert all(x.base is None for x in frames.values())  # none holds a whole stack in memory
-
-
 def target(r: float, gamma_n: float, end: int, q2: list[float], q2_online: list[float]) -> float:
-    """td_target of one transition, on plain numbers."""
     b = Batch(None, None, torch.tensor([r]), None, torch.tensor([gamma_n]), torch.tensor([end]))
     return td_target(b, torch.tensor([q2]), torch.tensor([q2_online])).item()
 
@@ -156,12 +144,10 @@ def test_a_mirrored_transition_is_true_in_the_mirrored_forest(monkeypatch: Monke
 
 
 def agent(c: DQNConfig, seed: int = 0) -> Agent:
-    """An agent of this seed."""
     return Agent(c, 9, np.random.default_rng(seed))
 
 
 def same(one: torch.nn.Module, two: torch.nn.Module) -> bool:
-    """Whether two networks have equal weights, to the last bit."""
     return all(map(torch.equal, one.parameters(), two.parameters()))
 
 
@@ -246,15 +232,13 @@ WALK = DQNConfig(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(("n_steps", "steps"), [(1, 800), (3, 500)])
-def test_dqn_solves_a_tiny_mdp(n_steps: int, steps: int) -> None:
+def test_dqn_solves_a_tiny_mdp() -> None:
     torch.set_num_threads(1)
-    c, envs = replace(WALK, n_steps=n_steps, steps=steps), Corridor()
-    *_, (one, _) = dqn.train(c, envs, np.random.default_rng(0), lambda r, _: r)
+    envs = Corridor()
+    *_, (one, _) = dqn.train(WALK, envs, np.random.default_rng(0), lambda r, _: r)
     assert dqn.greedy(one.q, envs.frames[1:5]).tolist() == [1, 1, 1, 1]
-    if n_steps == 1:  # longer windows hold a random walk's rewards, so their values are lower
-        best = one.q(torch.from_numpy(envs.frames[1:5])).max(1).values.tolist()
-        assert best == approx([0.9**3, 0.9**2, 0.9, 1.0], abs=0.1)
+    best = one.q(torch.from_numpy(envs.frames[1:5])).max(1).values.tolist()
+    assert best == approx([0.9**3, 0.9**2, 0.9, 1.0], abs=0.1)
 
 
 def test_the_loop_acts_greedily_syncs_the_target_network_and_averages_the_last_share() -> None:
@@ -262,14 +246,13 @@ def test_the_loop_acts_greedily_syncs_the_target_network_and_averages_the_last_s
     c, envs = replace(c, epsilon_final=0.0, epsilon_decay=1, swa_fraction=0.25), Corridor()
     loop = dqn.train(c, envs, np.random.default_rng(0), lambda r, _: r)
     one, replay = next(loop)
-    first = synced = one.q.head[2].weight.detach().clone()
+    synced = one.q.head[2].weight.detach().clone()
     choice, last = dqn.greedy(one.q, envs.frames[1:5]), []
     for step, _ in zip(range(4, 164, 4), loop, strict=True):
         assert (envs.taken == choice[envs.before]).all()
         assert (4 * replay.added, envs.steps, one.epsilon) == (step, step, 0.0)
         assert one.optimizer.param_groups[0]["lr"] == approx(1e-3 * (1 - 0.5 * step / 160))
         q, choice = one.q.head[2].weight.detach().clone(), dqn.greedy(one.q, envs.frames[1:5])
-        assert torch.equal(q, first) == (step < 80)
         synced = q if step % 36 == 0 else synced
         assert torch.equal(one.q_target.head[2].weight, synced)
         last += [q] if step > 120 else []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pytest import approx
 
-from env import Drone, VecForest, World, fly, plant, random_pilot, refly, reward, straight_pilot
+from env import Drone, VecForest, World, fly, plant, refly, reward, straight_pilot
 
 WORLD = World()
 CLEARING = replace(WORLD, rows=0)  # no trunks
@@ -25,7 +25,6 @@ def flown(world: World, actions: Sequence[int], seed: int = 0) -> Drone:
 
 
 def begun(world: World, seeds: Sequence[int], blind: bool = False) -> VecForest:
-    """One drone at the start of each of these forests."""
     envs = VecForest(world, len(seeds), seeds, blind=blind)
     envs.reset_done()
     return envs
@@ -41,7 +40,6 @@ def test_the_reward_at_every_knee_of_the_papers_formula() -> None:
         (20.0, 45.0, 0.75),  # half the way made
         (20.0, 0.0, 1.25),  # at the goal
         (20.0, 99.0, 0.15),  # behind the start
-        (1.375, 45.0, -2.0),
         (1.5, 60.0, -2 + 1 / 3),  # the file's own example
     ):
         assert [reward(o, d_obs, d_goal, WORLD) for o in ("", "goal", "time")] == approx(
@@ -61,11 +59,6 @@ def test_a_forest_is_150_trunks_within_the_jitter_of_the_grid() -> None:
 def test_a_forest_is_a_function_of_its_seed_alone() -> None:
     assert (plant(3 * 10**9, WORLD) == plant(3 * 10**9, WORLD)).all()
     assert (plant(1, WORLD) != plant(2, WORLD)).all()
-    one, two = flown(WORLD, [4] * 9, seed=7), flown(WORLD, [], seed=8)
-    one.reset(8)
-    assert [(one.step(4), one.d_obs) for _ in range(9)] == [
-        (two.step(4), two.d_obs) for _ in range(9)
-    ]
 
 
 def test_each_action_flies_the_arc_of_its_yaw_rate() -> None:
@@ -82,7 +75,10 @@ def test_d_obs_is_the_distance_to_the_nearest_surface_and_below_0_75_m_a_crash()
     for seed in range(20):
         drone = flown(WORLD, [], seed)
         while not drone.outcome:
+            before = drone.pose[0], drone.progress
             drone.step(int(rng.integers(2, 7)))
+            assert drone.forward == drone.pose[0] - before[0]
+            assert drone.progress == max(drone.pose[0], before[1])
             brute = np.linalg.norm(plant(seed, WORLD) - drone.pose[:2], axis=1).min() - 0.5
             assert drone.d_obs == approx(min(brute, 20.0), abs=1e-9)
             assert drone.d_goal == approx(math.dist(drone.pose[:2], (90, 0)))
@@ -92,13 +88,10 @@ def test_d_obs_is_the_distance_to_the_nearest_surface_and_below_0_75_m_a_crash()
 
 
 ENDS = {
-    "crash": [4] * 175,
-    "goal": [4] * 175,
-    "side": [8] * 22 + [4] * 50,
-    "back": [8] * 45 + [4] * 60,
+    "crash": [4] * 175, "goal": [4] * 175, "side": [8] * 22 + [4] * 50,
+    "back": [8] * 45 + [4] * 60, "time": [4] * 40 + [8] * 960,
     "far": [8] * 4 + [4] * 30 + [0] * 4 + [4] * 160,
-    "time": [4] * 40 + [8] * 960,
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("outcome", ENDS)
@@ -114,29 +107,6 @@ def test_each_outcome_is_reached_and_only_time_truncates(outcome: str) -> None:
     facts = {"crash": drone.d_obs < 0.75, "goal": math.dist((x, y), (90, 0)) < 3, "time": late}
     facts |= {"far": x > 90, "back": x < -2, "side": abs(y) > 25}
     assert [name for name, fact in facts.items() if fact] == [outcome]
-
-
-def test_forward_is_the_way_gained_along_x_and_progress_the_largest_x() -> None:
-    rng, drone, xs, gained = np.random.default_rng(1), flown(CLEARING, []), [0.0], 0.0
-    while not drone.outcome:  # it turns left, and so flies forward and back
-        drone.step(int(rng.integers(5, 9)))
-        gained += drone.forward
-        xs.append(drone.pose[0])
-        assert (gained, drone.progress) == approx((xs[-1], max(xs)))
-    assert min(np.diff(xs)) < 0 < max(np.diff(xs))
-    drone.reset(1)
-    assert (drone.forward, drone.progress, drone.total) == (0.0, 0.0, 0.0)
-
-
-def test_no_episode_goes_on_after_its_end_and_no_drone_steps_over_a_trunk() -> None:
-    for drone in (Drone(WORLD), flown(WORLD, [4] * 175)):
-        with pytest.raises(ValueError, match=r"the episode has ended \((not reset|crash)\)"):
-            drone.step(4)
-    for action in (-1, 9):
-        with pytest.raises(ValueError, match="no such action"):
-            flown(WORLD, [action])
-    with pytest.raises(ValueError, match="speed"):
-        World(speed=13.0)
 
 
 def test_an_observation_is_the_last_four_frames_and_at_first_one_frame_four_times() -> None:
@@ -190,12 +160,6 @@ def test_an_episode_is_its_seed_and_its_actions() -> None:
         for (s, pose), (again, drone) in zip(steps, refly(episode, world), strict=True):
             assert (s == again).all() and pose == drone.pose
         assert drone.episode() == episode
-
-
-def test_the_random_pilot_draws_its_actions_uniformly() -> None:
-    pilot, envs = random_pilot(np.random.default_rng(0)), VecForest(WORLD, 1, [])
-    drawn = pilot(np.zeros((90_000, 0)), envs)
-    assert np.bincount(drawn) / 90_000 == approx(1 / 9, abs=0.004)  # four standard errors
 
 
 def test_fly_returns_one_episode_a_seed_in_their_order() -> None:
