@@ -6,7 +6,7 @@
     python deepflight.py eval                   fly weights/dqn.pt, which `train` made
     python deepflight.py eval --weights FILE    fly other weights
 
-The loop that learns is dqn.train. Here stands what an experiment needs around it: the settings, the
+The loop that learns is dqn.train. This file holds the rest of the experiment: the settings, the
 shaped reward, validation, files, then `eval` with its statistics, and the command line.
 
 `train` prints a row after each validation:
@@ -57,7 +57,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
 from functools import cache, partial
 from itertools import count, takewhile
@@ -154,7 +154,7 @@ class Run:
 
     def save(self) -> None:
         """Write the checkpoint, 34 MB. Of the replay it holds the actions, one byte each."""
-        content = {"config": asdict(self.c), "pilot": self.c.pilot, "actions": self.envs.actions}
+        content = {"config": asdict(self.c), "kind": kind(self.c), "actions": self.envs.actions}
         content |= {"agent": self.agent.state_dict(), "rng": self.rng.bit_generator.state}
         content |= {"optimizer": self.agent.optimizer.state_dict(), "log": self.log}
         save(self.folder / "checkpoint.pt", content | {"forests": self.forests.bit_generator.state})
@@ -173,10 +173,10 @@ class Run:
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state, self.log = saved["rng"], saved["log"]
-        if self.envs.steps <= (1 - self.c.swa_fraction) * self.c.steps:
+        if saved["config"]["steps"] != self.c.steps:
             self.agent.mean.n_averaged.zero_()  # a longer training averages its own last share
 
-    def validate(self) -> None:
+    def validate(self, seconds: float) -> None:
         """Fly the validation forests without exploring, and add a row to the log. best.pt keeps the
         weights of the best score: the share that crossed, and among equals the progress. In the
         last share of the steps it keeps the mean of the weights instead, whatever its score,
@@ -190,7 +190,7 @@ class Run:
         row["epsilon"] = self.agent.epsilon
         row |= {f"{w}_{k}": float(x.mean()) for w in flown for k, x in measure(flown[w]).items()}
         row["validation_longer"] = row["validation_steps"] / random_steps(self.envs.world) - 1
-        self.log.append(row)
+        self.log.append(row | {"seconds": seconds})
         share = "validation_goal" if self.c.beacon else "validation_crossed"
         scores = [(row[share], row["validation_progress"]) for row in self.log]
         if averaged or scores[-1] > max(scores[:-1], default=(-1, 0)):
@@ -198,10 +198,13 @@ class Run:
 
     def go(self) -> int:
         """Train, validate, log, save, until the last step or a signal; returns the exit code."""
-        envs, c, folder, clock = self.envs, self.c, self.folder, time.perf_counter()
-        first, before = envs.steps, self.log[-1]["seconds"] if self.log else 0
+        envs, c, folder = self.envs, self.c, self.folder
+        start = time.perf_counter() - (self.log[-1]["seconds"] if self.log else 0)
         with (folder / ".lock").open("w") as file, stop_signals() as stopped:
-            lock(file)
+            with suppress(ImportError):  # Windows: nothing keeps a second training out
+                import fcntl
+
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             atomic_write(folder / "config.json", json.dumps(asdict(c), indent=2).encode())
             self.save()
             print(f"to {folder}: {c.steps:,} steps, {c.num_envs} at a time\n\n{HEAD}", flush=True)
@@ -209,16 +212,14 @@ class Run:
                 if not math.isfinite(self.agent.loss):
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")
                 if dqn.due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
-                    seconds = time.perf_counter() - clock
-                    speed = (envs.steps - first) / seconds
-                    self.validate()
-                    self.log[-1]["seconds"] = before + seconds
-                    table = [self.log[0].keys(), *(row.values() for row in self.log)]
+                    seconds = time.perf_counter() - start
+                    self.validate(seconds)
+                    table = [self.log[0], *(row.values() for row in self.log)]
                     text = "".join(",".join(map(str, line)) + "\n" for line in table)
                     atomic_write(folder / "log.csv", text.encode())
                     self.save()
-                    left = (c.steps - envs.steps) / speed / 60
-                    print(ROW.format(**self.log[-1], speed=speed, left=left), flush=True)
+                    left, speed = (c.steps / envs.steps - 1) * seconds / 60, envs.steps / seconds
+                    print(ROW.format(**self.log[-1], left=left, speed=speed), flush=True)
                 if stopped and envs.steps < c.steps:
                     self.save()
                     typed = takewhile(lambda word: word != "train", sys.orig_argv)
@@ -271,21 +272,21 @@ def fly_random(seeds: Sequence[int], world: World) -> list[Episode]:
 
 
 def evaluate(args: argparse.Namespace, pilots: dict[str, Pilot]) -> int:
-    """Fly a network beside other pilots through the same forests: a table, JSON, and a film."""
-    torch.set_num_threads(args.threads)
+    """Fly a network beside other pilots, which see nothing, through the same forests: a table,
+    JSON, and a film of the network's first episode that crossed."""
     shipped = Path(__file__).parent / "weights" / ("dqn-beacon.pt" if args.beacon else "dqn.pt")
     q, world, name = load_weights(args.weights or shipped)
     film, seeds = args.out / "flight.gif", range(args.first_seed, args.first_seed + args.episodes)
-    if not seeds or seeds[0] < 0:
-        raise InputError("episodes must be 1 or more, and first-seed 0 or more")
+    if not seeds or seeds[0] < 0 or args.threads < 1:
+        raise InputError("episodes and threads must be 1 or more, and first-seed 0 or more")
+    torch.set_num_threads(args.threads)
     for path in (film, args.json or film):  # better to fail now than after all episodes
         path.parent.mkdir(parents=True, exist_ok=True)
         path.open("ab").close()
     print(f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n", flush=True)
     flown = {"random": fly_random(seeds, world)}
-    for who, pilot in {"straight": env.straight_pilot, **pilots}.items():
-        flown[who] = fly(pilot, seeds, world, blind=True)
-    flown[name] = fly(dqn_pilot(q), seeds, world)
+    others = {"straight": env.straight_pilot, **pilots, name: dqn_pilot(q)}
+    flown |= {who: fly(pilot, seeds, world, blind=who != name) for who, pilot in others.items()}
     draws = np.random.default_rng(0).integers(len(seeds), size=(2000, len(seeds)))
     metrics = {who: summarize(flown[who], flown["random"], draws) for who in flown}
     print_table(metrics)
@@ -351,16 +352,15 @@ def wilson(p: float, n: int) -> dict[str, float]:
     return {"value": float(p), "low": max(middle - half, 0.0), "high": min(middle + half, 1.0)}
 
 
-TABLE = {  # metric -> label, factor
-    "goal": ("arrived, %", 100), "crossed": ("crossed, %", 100), "crash": ("crashed, %", 100),
-    "steps": ("steps", 1), "longer": ("longer, %", 100), "return": ("return", 1),
-}  # fmt: skip
+TABLE = {"goal": "arrived, %", "crossed": "crossed, %", "crash": "crashed, %", "steps": "steps",
+         "longer": "longer, %", "return": "return"}  # fmt: skip
 
 
 def print_table(metrics: dict[str, dict]) -> None:
     """One row a metric, one column a pilot."""
     print(f"{'':10}" + "".join(f"{name:>17}" for name in metrics))
-    for key, (label, factor) in TABLE.items():
+    for key, label in TABLE.items():
+        factor = 100 if "%" in label else 1
         cells = [[f"{factor * x:z.0f}" for x in metrics[name][key].values()] for name in metrics]
         print(f"{label:10}" + "".join(f"{f'{x} [{low}, {high}]':>17}" for x, low, high in cells))
 
@@ -372,9 +372,10 @@ def draw_film(episode: Episode, world: World, q: QNetwork, name: str) -> Iterato
     for t, (s, drone) in enumerate(env.refly(episode, world)):
         path.append(drone.pose[:2])
         action = int(episode["actions"][t]) if t < episode["steps"] else -1  # -1: none is chosen
-        values = q(torch.from_numpy(s)[None])[0].numpy() if name == "dqn" else None  # (A,)
+        values = q(torch.from_numpy(s)[None])[0].numpy()  # (A,)
         text = f"{name}: {t * world.dt:.1f} s, {drone.d_goal:.1f} m to the goal\n"
-        text += f"reward so far {drone.total:.1f}   {drone.outcome}"
+        text += f"reward so far {drone.total:.1f}   {drone.outcome}\n"
+        text += f"bars: {'Q' if name == 'dqn' else 'score'} of each turn, left to right"
         yield render.draw_panel(s[-1], trunks, np.array(path), drone.outcome, values, action, text)
 
 
@@ -427,16 +428,9 @@ def load_weights(path: Path | str) -> tuple[QNetwork, World, str]:
     return q, World(beacon=saved["beacon"], camera=saved["camera"]), saved["pilot"]
 
 
-def lock(file: Any) -> None:
-    """Keep a second training out as long as this file is open."""
-    try:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except ImportError:
-        pass  # Windows: nothing keeps it out
-    except BlockingIOError:
-        raise InputError(f"{file.name}: another training is running there") from None
+def kind(c: Config | type[Config]) -> list:
+    """What must be the same where a training goes on, or its numbers would differ."""
+    return [c.pilot, str(torch.__version__), f"bfloat16 {dqn.BFLOAT16}"]
 
 
 # -------------------------------------------------- the command line
@@ -485,10 +479,10 @@ def start(args: argparse.Namespace, config: type[Config], train: Callable) -> Ru
         return run
     if args.name or given.keys() - {"steps"}:
         raise InputError(f"{args.resume} keeps its settings: only --steps may be given")
-    keys = "config", "pilot", "actions", "forests", "agent", "optimizer", "rng", "log"
+    keys = "config", "kind", "actions", "forests", "agent", "optimizer", "rng", "log"
     saved = load(args.resume / "checkpoint.pt", *keys)
-    if saved["pilot"] != config.pilot:
-        raise InputError(f"{args.resume} trains a pilot called {saved['pilot']}")
+    if saved["kind"] != kind(config):
+        raise InputError(f"{args.resume} is of kind {saved['kind']}, here is {kind(config)}")
     c = config(**saved["config"] | given)
     if (flown := len(saved["actions"]) * c.num_envs) >= c.steps:
         raise InputError(f"{args.resume} has flown {flown:,} steps: give more by --steps")
@@ -508,6 +502,8 @@ def main(
         return code
     except KeyboardInterrupt:
         why, code = "interrupted", 130
+    except BlockingIOError:
+        why, code = "another training is running in this folder", 2
     except (InputError, OSError, MemoryError, FloatingPointError) as error:
         why, code = error, 2
     print(f"deepflight.py: {why}", file=sys.stderr)

@@ -5,11 +5,11 @@ reward r and the next observation s2. The **return** is the sum of all rewards t
 that is k steps away counts gamma^k times. gamma is the discount, 0.99, so soon is worth more than
 late. Three rewards 1, 1, -10 and then the end: 1 + 0.99 * 1 + 0.99^2 * -10 = -7.81.
 
-**Q(s, a)** is the return to expect after action a in s, if the best action follows ever after. An
-agent that knows Q can act: it takes the action of greatest Q. Here a neural network learns Q, a
-function with 1.7 million adjustable numbers, its weights: four frames go in, nine numbers come out.
-For each Q(s, a) it needs a target y to learn. Nobody has the true one. But the return from s is r
-plus gamma times the return from s2, so every transition (s, a, r, s2) makes a target of its own:
+**Q(s, a)** is the return to expect after action a in s, if the best action is taken in every later
+step. An agent that knows Q can act: it takes the action with the highest Q. Here a neural network
+learns Q. It is a function with 1.7 million adjustable numbers, its weights: four frames go in, nine
+numbers come out. For each Q(s, a) it needs a target y. Nobody has the true one. But the return from
+s is r plus gamma times the return from s2, so every transition (s, a, r, s2) makes its own target:
 
     y = r + gamma * max over a2 of Q(s2, a2)        or y = r, if the world ended the episode
 
@@ -55,8 +55,8 @@ Algorithm 1 of [Mnih15]; `train` carries its numbers:
     15          every C steps reset Q^ = Q
 
 Legend: A actions, B transitions in a batch, L environments side by side, T rows of the replay.
-[+name] marks what is not in the textbook; the setting of that name switches it off. (Two more are
-always on, because they only save time: Adam in place of Mnih's RMSprop, and bfloat16.)
+[+name] marks what is not in the textbook; the setting of that name switches it off. Three
+more are always on: Adam in place of Mnih's RMSprop, bfloat16, and rewards that are not clipped.
 """
 
 import copy
@@ -73,12 +73,12 @@ from torch.optim.swa_utils import AveragedModel
 
 # How a transition ended: not at all, by the time limit, or in the world itself (env.py tells more).
 LIVE, TRUNCATED, TERMINAL = range(3)
-# Numbers of half as many bits make convolutions quicker, on processors that can reckon with them.
+# Numbers of half as many bits make convolutions quicker, on processors that know them.
 BFLOAT16 = bool(torch.cpu.get_capabilities().get("avx512_bf16"))
 
 
 class InputError(ValueError):
-    """Something that whoever started the program can mend."""
+    """An error that the user can mend."""
 
 
 def setting(default: Any, text: str, *legal: Any) -> Any:
@@ -224,10 +224,8 @@ class Replay:
         row = self.added % self.rows
         self.frames[row], self.actions[row], self.rewards[row] = s[:, -1], a, r
         self.ends[row] = np.where(terminated, TERMINAL, np.where(truncated, TRUNCATED, LIVE))
-        for env in range(self.num_envs):
-            self.last_frames.pop((row, env), None)
-            if truncated[env]:
-                self.last_frames[row, env] = s2[env, -1].copy()
+        for env in np.flatnonzero(truncated):
+            self.last_frames[row, env] = s2[env, -1].copy()
         self.added += 1
 
     def sample(self, size: int, n: int, gamma: float, rng: Generator) -> Batch:
@@ -272,8 +270,7 @@ class Replay:
         rows = [row]
         for _ in range(3):
             before = (rows[0] - 1) % self.rows  # (B,)
-            same_episode = self.ends[before, env] == LIVE  # (B,)
-            rows.insert(0, np.where(same_episode, before, rows[0]))
+            rows.insert(0, np.where(self.ends[before, env] == LIVE, before, rows[0]))
         return self.frames[np.stack(rows, 1), env[:, None]]  # (B, 4, 84, 84)
 
 
@@ -299,8 +296,8 @@ class Agent(nn.Module):
     Adam keeps two running means for each weight: m of its gradient g, and v of g^2. A running mean
     goes a small part of the way to each new number: m = 0.9 * m + 0.1 * g. The weight moves by
     -lr * m / (sqrt(v) + eps), so all weights move about equally fast, except those with tiny
-    gradients. Rainbow's eps of 1.5e-4 belongs to errors of 1 at most [Hessel 2018]. Ours may be
-    ten times as large, and with them all gradients, so our eps is ten times as large too.
+    gradients. (Adam also corrects for m and v starting at 0.) Rainbow's eps is 1.5e-4 [Hessel
+    2018]. Gradients grow with huber_delta, so our eps does too: it is ten times as large.
     """
 
     def __init__(self, c: DQNConfig, actions: int, rng: Generator) -> None:
@@ -405,7 +402,7 @@ def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator
     replay = Replay(c.replay_size, c.num_envs)  # 1
     agent = Agent(c, envs.num_actions, rng)  # 2, 3
     yield agent, replay
-    # step: how many control steps there will have been after the pass
+    # step: the number of control steps after this pass
     for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):  # 4
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
@@ -416,8 +413,7 @@ def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator
         a = np.where(explore, random, greedy(agent.q, s))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
         replay.add(s, a, shaped(r, drones), s2, terminated, truncated)  # 11
-        updates = due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0
-        for _ in range(updates):
+        for _ in range(due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0):
             batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
             batch = mirror(batch, envs.num_actions, rng) if c.mirror else batch  # [+mirror]
             learn(agent, batch, c)  # 13, 14

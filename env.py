@@ -74,20 +74,16 @@ class World(Scene):
     """The forest, the drone and the rules, in SI units; from `Scene`, what they look like."""
 
     length: float = 90.0  # m, x of the far edge; d_max of the reward [DF §II-A]
-    width: float = 50.0  # m; this and all down to jitter_y: authors' simulator
+    width: float = 50.0  # m; this and all down to jitter: authors' simulator
     back: float = 2.0  # m, how far the drone may retreat behind the start
-    rows: int = 15  # trunks along x
-    columns: int = 10  # trunks along y
-    first_x: float = 7.5  # m, of the grid before jitter
-    first_y: float = -22.0  # m
-    spacing_x: float = 6.0  # m
-    spacing_y: float = 5.0  # m
-    jitter_x: float = 1.0  # m, uniform, either way
-    jitter_y: float = 2.5  # m
+    grid: tuple[int, int] = (15, 10)  # trunks along x and along y
+    first: tuple[float, float] = (7.5, -22.0)  # m, x and y of the first one before jitter
+    spacing: tuple[float, float] = (6.0, 5.0)  # m
+    jitter: tuple[float, float] = (1.0, 2.5)  # m, uniform, either way
     speed: float = 5.0  # m/s, authors' simulator
     dt: float = 0.1  # s, one control step: ours
     yaw_rate: float = 0.7  # rad/s, the sharpest turn [DF §II-A]
-    actions: int = 9  # yaw rates from -0.7 (right) to +0.7 (left) [DF §II-A]
+    actions: int = 9  # yaw rates from -0.7 (right) to +0.7 (left), at most 10 [DF §II-A]
     laser_range: float = 20.0  # m, authors' simulator
     d_neg: float = 2.0  # m, this and the next four: [DF §II-A]
     d_crash: float = 0.75  # m
@@ -107,7 +103,7 @@ def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
     """The reward of one step, [DF §II-A] line by line.
 
     outcome: "" in the air, else one of OUTCOMES. d_obs, d_goal: m. The paper prints the
-    inequality of r_near in reverse, which we turn round. The authors' simulator computes r_goal
+    inequality of r_near in reverse, which we correct. The authors' simulator computes r_goal
     and forgets to add it; we add it, as the paper says.
 
     >>> reward("", 3.0, 45.0, World()), reward("", 0.75, 90.0, World())
@@ -124,11 +120,9 @@ def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
 
 def plant(seed: int, world: World) -> ndarray:
     """Trunk centres (N, 2) in m: a jittered grid, a function of the seed alone."""
-    x = world.first_x + world.spacing_x * np.arange(world.rows)
-    y = world.first_y + world.spacing_y * np.arange(world.columns)
-    grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)  # (N, 2)
-    jitter = np.random.default_rng(seed).uniform(-1, 1, grid.shape)  # (N, 2)
-    return grid + jitter * (world.jitter_x, world.jitter_y)
+    cells = np.indices(world.grid).reshape(2, -1).T  # (N, 2): 0 0, 0 1, ... 14 9
+    jitter = np.random.default_rng(seed).uniform(-1, 1, cells.shape)  # (N, 2)
+    return world.first + cells * world.spacing + jitter * world.jitter
 
 
 class Drone:
@@ -143,7 +137,7 @@ class Drone:
     def __init__(self, world: World) -> None:
         self.world, self.outcome = world, "not reset"  # counts as an episode that has ended
         self.space, self.body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-        ground, trunks = self.space.static_body, world.rows * world.columns
+        ground, trunks = self.space.static_body, math.prod(world.grid)
         self.shapes = [pymunk.Circle(ground, world.trunk_radius) for _ in range(trunks)]
         self.space.add(self.body, *self.shapes)
 
@@ -164,8 +158,7 @@ class Drone:
         """
         world = self.world
         if self.outcome or not 0 <= action < world.actions:
-            why = f"the episode has ended ({self.outcome})" if self.outcome else "no such action"
-            raise ValueError(f"action {action}: {why}")
+            raise ValueError(f"no action {action}, or the episode has ended ({self.outcome})")
         self.actions.append(int(action))
         yaw_rate = world.yaw_rate * (2 * action / (world.actions - 1) - 1)  # rad/s
         heading = self.body.angle + yaw_rate * world.dt  # rad: turn first, then fly
@@ -184,17 +177,16 @@ class Drone:
         (x, y), x_before = self.body.position, self.pose[0]
         self.pose = (x, y, self.body.angle)
         self.forward, self.progress = x - x_before, max(self.progress, x)
-        reach = self.world.laser_range
-        trunk = self.space.point_query_nearest((x, y), reach, pymunk.ShapeFilter())
-        self.d_obs = trunk.distance if trunk else reach  # None: out of reach
+        trunk = self.space.point_query_nearest((x, y), self.world.laser_range, pymunk.ShapeFilter())
+        self.d_obs = trunk.distance if trunk else self.world.laser_range  # None: out of reach
         self.d_goal = math.dist((x, y), (self.world.length, 0))
 
     def judge(self) -> str:
         """How the episode has ended: one of OUTCOMES, tested in their order, or "" in the air."""
         (x, y, _), world = self.pose, self.world
-        late = len(self.actions) >= world.max_steps
-        ended = (self.d_obs < world.d_crash, self.d_goal < world.goal_radius, x > world.length,
-                 x < -world.back, abs(y) > world.width / 2, late)  # fmt: skip
+        near, late = self.d_goal < world.goal_radius, len(self.actions) >= world.max_steps
+        ended = (self.d_obs < world.d_crash, near, x > world.length, x < -world.back,
+                 abs(y) > world.width / 2, late)  # fmt: skip
         return OUTCOMES[ended.index(True)] if any(ended) else ""
 
     def episode(self) -> Episode:
@@ -214,9 +206,7 @@ class VecForest:
     do not look.
     """
 
-    def __init__(
-        self, world: World, num_envs: int, seeds: Iterable[int], *, blind: bool = False
-    ) -> None:
+    def __init__(self, world: World, num_envs: int, seeds: Iterable, blind: bool = False) -> None:
         self.world, self.num_actions, self.blind = world, world.actions, blind
         self.drones, self.seeds = [Drone(world) for _ in range(num_envs)], iter(seeds)
         self.episodes: list[Episode] = []  # all that have ended
@@ -230,28 +220,23 @@ class VecForest:
 
     def reset_done(self) -> ndarray:
         """Begin an episode where none is active; returns all observations (E, 4, 84, 84) uint8."""
-        done = [drone for drone in self.drones if drone.outcome]
-        for drone, seed in zip(done, self.seeds, strict=False):
+        for drone, seed in zip([d for d in self.drones if d.outcome], self.seeds, strict=False):
             drone.reset(seed)
-        begun = [drone for drone in done if not drone.outcome]
+        begun = [drone for drone in self.active if not drone.actions]
         for drone, frame in zip(begun, self.look(begun), strict=True):
             drone.observation = np.repeat(frame[None], STACK, 0)  # (4, 84, 84)
         return np.array([drone.observation for drone in self.active])  # (E, 4, 84, 84)
 
-    def step(
-        self, actions: Iterable[int]
-    ) -> tuple[ndarray, ndarray, ndarray, ndarray, list[Drone]]:
+    def step(self, actions: Iterable[int]) -> tuple:
         """One control step of the active drones; actions: one for each, in order.
 
         Returns observations (E, 4, 84, 84), rewards (E,), terminated (E,), truncated (E,), drones.
         """
         drones = self.active
         r = np.array([drone.step(a) for drone, a in zip(drones, actions, strict=True)])  # (E,)
-        s2 = np.empty((len(drones), STACK, PIXELS, PIXELS), np.uint8)  # (E, 4, 84, 84)
-        s2[:, -1] = self.look(drones)
-        for drone, stack in zip(drones, s2, strict=True):
-            stack[:-1] = drone.observation[1:]
-            drone.observation = stack
+        for drone, frame in zip(drones, self.look(drones), strict=True):
+            drone.observation = np.concatenate([drone.observation[1:], frame[None]])
+        s2 = np.array([drone.observation for drone in drones])  # (E, 4, 84, 84)
         self.actions.append(bytes(drone.actions[-1] for drone in drones))
         self.steps += len(drones)
         self.episodes += [drone.episode() for drone in drones if drone.outcome]
@@ -278,7 +263,7 @@ def random_pilot(rng: np.random.Generator) -> Pilot:
 
 
 def straight_pilot(s: ndarray, envs: VecForest) -> list[int]:
-    """Straight ahead, whatever comes."""
+    """Always straight ahead."""
     return [envs.num_actions // 2] * len(s)
 
 

@@ -150,11 +150,11 @@ def background(scene: Scene) -> ndarray:
 
 
 def layer(
-    distance: ndarray, height: float, grey: ndarray, haze: ndarray, scene: Scene
+    distance: ndarray, height: float, grey: ndarray | float, haze: ndarray, scene: Scene
 ) -> tuple[ndarray, ndarray]:
     """How cylinders look whose surface is at distance (E, 84) m, inf where there is none.
 
-    height: m. grey, haze (E, 84): see `shade`. Returns a mask (E, 84, 84) of the pixels that they
+    height: m. grey, haze: (E, 84), see `shade`. Returns a mask (E, 84, 84) of the pixels that they
     cover, and the value (E, 1, 84) uint8 of these pixels in each column.
     """
     depth = distance * COSINES  # (E, 84) m, along the optical axis
@@ -189,9 +189,8 @@ def camera(
     goal = np.concatenate([seen_from(pose, np.array([beacon])) for pose in poses])  # (E, 2) m
     radius = np.maximum(scene.beacon_radius, scene.beacon_pixels / 2 / FOCAL * goal[:, 0])  # (E,) m
     pole, cosine = raycast(goal, radius, BEARINGS, np.arange(len(poses)), len(poses))  # (E, 84)
-    grey = np.full_like(pole, scene.beacon_grey)  # (E, 84)
     hidden = mask & (distance < pole)[:, None]  # (E, 84, 84) by a nearer trunk
-    mask, value = layer(pole, scene.beacon_height, grey, 0 * cosine, scene)
+    mask, value = layer(pole, scene.beacon_height, scene.beacon_grey, 0 * cosine, scene)
     return np.where(mask & ~hidden, value, frames)
 
 
@@ -211,29 +210,25 @@ def seen_from(pose: ndarray, points: ndarray) -> ndarray:
 # -------------------------------------------------- the film's picture: skip this at first
 
 PANEL = (624, 328)  # px, of a picture; it is drawn twice as large, so that lines become smooth
-RED, GREEN, BLUE, GREY = "#d62728", "#2ca02c", "#1f77b4", "#8a8a80"
 
 
 def draw_panel(
-    frame: ndarray, trunks: ndarray, path: ndarray, outcome: str,
-    q: ndarray | None, action: int, text: str,
-) -> Image.Image:  # fmt: skip
+    frame: ndarray, trunks: ndarray, path: ndarray, outcome: str, q: ndarray, action: int, text: str
+) -> Image.Image:
     """One picture: the frame (84, 84), the path (T, 2) on a map of the trunks (N, 2), both in m,
-    and the values q (A,), if there are any, left turns on the left, the chosen action in red."""
-    image = Image.new("RGB", (2 * PANEL[0], 2 * PANEL[1]), "white")
+    and what the network says of each action, q (A,), left turns on the left, the chosen one red."""
+    image = Image.new("RGB", (2 * PANEL[0], 2 * PANEL[1]), "#f4f4ee")
     draw = ImageDraw.Draw(image)
-    draw.rectangle([464, 0, 1248, 464], fill="#f2f2ea")
     image.paste(Image.fromarray(frame).resize((464, 464), Image.Resampling.NEAREST))
     trunks, path = (points * (8, -8) + (496, 232) for points in (trunks, path))  # px
     for trunk in trunks:
-        draw.circle(tuple(trunk), 4, fill=GREY)
-    colour = {"": BLUE, "goal": GREEN, "far": GREEN}.get(outcome, RED)
+        draw.circle(tuple(trunk), 4, fill="gray")
+    colour = {"": "royalblue", "goal": "seagreen", "far": "seagreen"}.get(outcome, "crimson")
     draw.line(path.ravel().tolist(), fill=colour, width=6)
     draw.circle(tuple(path[-1]), 8, fill=colour)
-    for a, value in enumerate(() if q is None else q):
+    for a, value in enumerate(q):
         x, height = 8 + 50 * (len(q) - 1 - a), 120 * (value - q.min()) / max(np.ptp(q), 1e-9)
-        draw.rectangle([x, 608 - height, x + 42, 612], fill=RED if a == action else GREY)
-    draw.text((8, 620), "" if q is None else "Q of each turn, left to right", GREY, font_size=26)
+        draw.rectangle([x, 608 - height, x + 42, 612], fill="crimson" if a == action else "gray")
     draw.text((496, 476), text, fill="black", font_size=34, spacing=8)
     return image.resize(PANEL, Image.Resampling.BOX)
 

@@ -11,7 +11,7 @@ from pytest import approx
 from env import Drone, VecForest, World, fly, plant, refly, reward, straight_pilot
 
 WORLD = World()
-CLEARING = replace(WORLD, rows=0)  # no trunks
+CLEARING = replace(WORLD, grid=(0, 0))  # no trunks
 OUT = ("crash", "far", "back", "side")
 
 

@@ -20,7 +20,7 @@ import dqn
 from deepflight import Config, Run, load, main
 from env import World, fly, straight_pilot
 
-KEYS = ("config", "pilot", "actions", "forests", "agent", "optimizer", "rng", "log")
+KEYS = ("config", "kind", "actions", "forests", "agent", "optimizer", "rng", "log")
 SMALL = {"steps": 400, "learning_starts": 100, "replay_size": 200, "target_every": 120}
 SMALL |= {"update_every": 16, "batch_size": 8}  # the replay wraps at step 200
 WORDS = [x for key, n in SMALL.items() for x in (f"--{key.replace('_', '-')}", str(n))]
@@ -140,7 +140,7 @@ def test_what_does_not_fit_a_checkpoint_is_refused(
         ("--threads 2 --steps 480", Small, whole.folder, "keeps its settings"),
         ("", Small, whole.folder, "has flown 400 steps"),
         ("--steps 200", Small, whole.folder, "has flown 400 steps"),
-        ("--steps 480", Other, whole.folder, "trains a pilot called dqn"),
+        ("--steps 480", Other, whole.folder, "is of kind ['dqn'"),
         ("--steps 480", Small, tmp_path, "its episodes end elsewhere"),
     ):
         assert main(["train", "--resume", str(folder), *words.split()], config) == 2

@@ -45,12 +45,11 @@ FIRST, FORESTS, WORST_OF = 2 * 10**9, 50, 500  # no training or validation plant
 def forest(density: float, speed: float, beacon: bool) -> World:
     """The same forest drawn smaller: trunks a square metre, times `density`."""
     shrink, w = math.sqrt(density), World()
-    rows, columns = round(w.rows * shrink), round(w.columns * shrink)
-    x, y = w.spacing_x / shrink, w.spacing_y / shrink  # m
-    first_y = -y * (columns - 1) / 2 + 0.5  # m, off centre as ever
-    jitter = {"jitter_x": w.jitter_x / shrink, "jitter_y": w.jitter_y / shrink}
-    size = {"rows": rows, "columns": columns, "spacing_x": x, "spacing_y": y, "first_y": first_y}
-    return World(speed=speed, beacon=beacon, **size, **jitter)
+    grid = tuple(round(n * shrink) for n in w.grid)
+    spacing, jitter = (tuple(x / shrink for x in pair) for pair in (w.spacing, w.jitter))  # m
+    first = w.first[0], -spacing[1] * (grid[1] - 1) / 2 + 0.5  # m, off centre as ever
+    size = {"grid": grid, "first": first, "spacing": spacing, "jitter": jitter}
+    return World(speed=speed, beacon=beacon, **size)
 
 
 def pilot(name: str) -> Pilot:

@@ -35,8 +35,8 @@ from extras.bridges.sb3_train import make_model
 from extras.experiments.peers import DRONES, PLAIN, REPLAY, RNG, doom, forest, ours, rooms, sb3
 
 ROOT, ROUNDS, SECONDS = Path(__file__).parents[2], 5, 4.0
-LONG = {"length": 900.0, "rows": 150}
-WIDE = LONG | {"width": 500.0, "columns": 100, "first_y": -247.0}
+LONG = {"length": 900.0, "grid": (150, 10)}
+WIDE = LONG | {"width": 500.0, "grid": (150, 100), "first": (7.5, -247.0)}
 FORESTS = {"150": {}, "1,500": LONG, "15,000": WIDE}  # trunks -> the world
 OURS = {"eight side by side": partial(forest, 8), "one alone": partial(forest, 1)}
 SCENES = {  # of the peers, the emptiest first

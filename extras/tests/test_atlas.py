@@ -14,7 +14,7 @@ def test_density_1_at_5_metres_a_second_is_the_papers_forest() -> None:
 
 @pytest.mark.parametrize("density", [0.5, 0.75, 1.5, 2.0])
 def test_trunks_grow_in_number_with_density_on_the_same_ground(density: float) -> None:
-    trunks = plant(0, replace(forest(density, 5.0, False), jitter_x=0.0, jitter_y=0.0))
+    trunks = plant(0, replace(forest(density, 5.0, False), jitter=(0.0, 0.0)))
     assert len(trunks) == pytest.approx(150 * density, rel=0.07)
     assert 86 < trunks[:, 0].max() < 92.5
     assert 21 < trunks[:, 1].max() < 24.5

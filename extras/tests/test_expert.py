@@ -21,7 +21,7 @@ from extras.lessons import expert
 from extras.lessons.expert import DemoConfig, ExpertBatch, ExpertConfig, ExpertReplay, plan, scan
 
 WORLD = World()
-CLEARING = replace(WORLD, rows=0)  # no trunks
+CLEARING = replace(WORLD, grid=(0, 0))  # no trunks
 ARRIVAL = Config(forward_reward=0.0, goal_bonus=125.0, far_bonus=0.0)
 # A training small enough to be done often: its replay wraps at step 160.
 SMALL = dict(learning_starts=80, replay_size=160, update_every=16, batch_size=8, target_every=64)
@@ -104,7 +104,7 @@ def test_the_planner_adds_up_the_rewards_to_come_in_any_world(
         speed=rng.uniform(2, 7), dt=rng.uniform(0.05, 0.15), yaw_rate=rng.uniform(0.3, 1.5),
         actions=int(rng.integers(2, 6)), laser_range=rng.uniform(3, 15), d_crash=0.6, d_neg=2.5,
         r_safe=rng.uniform(0, 1), r_precrash=-rng.uniform(1, 9), r_crash=-rng.uniform(5, 50),
-        goal_radius=rng.uniform(0.5, 4), rows=3, columns=3, first_y=-6.0,
+        goal_radius=rng.uniform(0.5, 4), grid=(3, 3), first=(7.5, -6.0),
     )  # fmt: skip
     for _ in range(5):
         x, y = rng.random(2) * (world.length, world.width) - (0, world.width / 2)
