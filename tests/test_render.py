@@ -13,7 +13,7 @@ from pytest import approx
 from render import BEARINGS, PANEL, Scene, background, camera, draw_panel, layer, raycast, save_film
 
 SCENE, STEREO = Scene(), Scene(camera="disparity")
-RED, GREY = (0xD6, 0x27, 0x28), (0x8A, 0x8A, 0x80)
+RED, GREY = (220, 20, 60), (128, 128, 128)
 NONE = np.empty((0, 2))
 
 
@@ -156,7 +156,7 @@ def test_a_film_shows_frame_trunks_path_and_values_at_its_pace(tmp_path: Path) -
     assert np.abs(shown - frame[np.ix_(nearest, nearest)]).mean() < 2
     x, y = 496 / 2, 232 / 2  # px, of the start: the map has 4 px a metre
     assert panel.getpixel((x + 4 * 45, y - 4 * 10)) == GREY and panel.size == PANEL
-    assert panel.getpixel((x + 4 * 45, y + 4 * 10)) == (0xF2, 0xF2, 0xEA)
+    assert panel.getpixel((x + 4 * 45, y + 4 * 10)) == (0xF4, 0xF4, 0xEE)
     assert panel.getpixel((x + 4 * 5, y)) == panel.getpixel((x + 4 * 9, y)) == RED
     heights = [
         int((np.asarray(panel)[240:306, 14 + 25 * (2 - a)] == c).all(1).sum())

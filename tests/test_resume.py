@@ -1,5 +1,6 @@
 """Interrupted is uninterrupted: a training that is cut and resumed ends with the same bytes."""
 
+import fcntl
 import shlex
 import shutil
 import signal
@@ -147,9 +148,9 @@ def test_what_does_not_fit_a_checkpoint_is_refused(
         error = capsys.readouterr().err
         assert named in error and error.count("\n") == 1
     with (whole.folder / ".lock").open("w") as file:
-        deepflight.lock(file)
+        fcntl.flock(file, fcntl.LOCK_EX)
         assert main(["train", "--resume", str(whole.folder), "--steps", "480"], Small) == 2
-    assert "another training is running there" in capsys.readouterr().err
+    assert "another training is running in this folder" in capsys.readouterr().err
     assert before == {path: path.read_bytes() for path in whole.folder.iterdir()}
 
 
