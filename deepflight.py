@@ -152,50 +152,6 @@ class Run:
         if saved:
             self.restore(saved)
 
-    def save(self) -> None:
-        """Write the checkpoint, 34 MB. Of the replay it holds the actions, one byte each."""
-        content = {"config": asdict(self.c), "kind": kind(self.c), "actions": self.envs.actions}
-        content |= {"agent": self.agent.state_dict(), "rng": self.rng.bit_generator.state}
-        content |= {"optimizer": self.agent.optimizer.state_dict(), "log": self.log}
-        save(self.folder / "checkpoint.pt", content | {"forests": self.forests.bit_generator.state})
-
-    def restore(self, saved: dict[str, Any]) -> None:
-        """Set everything as it was. All actions since the first step are flown again, which puts
-        the same transitions into the replay."""
-        print(f"flying {len(saved['actions']) * self.c.num_envs:,} steps again", flush=True)
-        for actions in saved["actions"]:
-            s = self.envs.reset_done()  # (L, 4, 84, 84)
-            s2, r, terminated, truncated, drones = self.envs.step(actions)
-            r = self.shaped(r, drones)  # (L,)
-            self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
-        if self.forests.bit_generator.state != saved["forests"]:
-            raise InputError(f"{self.folder}: on this machine its episodes end elsewhere")
-        self.agent.load_state_dict(saved["agent"])
-        self.agent.optimizer.load_state_dict(saved["optimizer"])
-        self.rng.bit_generator.state, self.log = saved["rng"], saved["log"]
-        if saved["config"]["steps"] != self.c.steps:
-            self.agent.mean.n_averaged.zero_()  # a longer training averages its own last share
-
-    def validate(self, seconds: float) -> None:
-        """Fly the validation forests without exploring, and add a row to the log. best.pt keeps the
-        weights of the best score: the share that crossed, and among equals the progress. In the
-        last share of the steps it keeps the mean of the weights instead, whatever its score,
-        because the best of many scores is partly luck."""
-        averaged = self.agent.mean.n_averaged > 0
-        q = copy.deepcopy(self.agent.mean.module if averaged else self.agent.q)
-        q = q.half().float()  # best.pt keeps half precision: fly that
-        recent = self.envs.episodes[-100:] or [drone.episode() for drone in self.envs.drones]
-        flown = {"train": recent, "validation": fly(dqn_pilot(q), VALIDATION, self.envs.world)}
-        row = {"step": self.envs.steps, "episodes": len(self.envs.episodes)}
-        row["epsilon"] = self.agent.epsilon
-        row |= {f"{w}_{k}": float(x.mean()) for w in flown for k, x in measure(flown[w]).items()}
-        row["validation_longer"] = row["validation_steps"] / random_steps(self.envs.world) - 1
-        self.log.append(row | {"seconds": seconds})
-        share = "validation_goal" if self.c.beacon else "validation_crossed"
-        scores = [(row[share], row["validation_progress"]) for row in self.log]
-        if averaged or scores[-1] > max(scores[:-1], default=(-1, 0)):
-            save_weights(self.folder / "best.pt", q, self.c)
-
     def go(self) -> int:
         """Train, validate, log, save, until the last step or a signal; returns the exit code."""
         envs, c, folder = self.envs, self.c, self.folder
@@ -228,32 +184,55 @@ class Run:
                     return 128 + stopped[0]
         return 0
 
+    def validate(self, seconds: float) -> None:
+        """Fly the validation forests without exploring, and add a row to the log. best.pt keeps the
+        weights of the best score: the share that crossed, and among equals the progress. In the
+        last share of the steps it keeps the mean of the weights instead, whatever its score,
+        because the best of many scores is partly luck."""
+        averaged = self.agent.mean.n_averaged > 0
+        q = copy.deepcopy(self.agent.mean.module if averaged else self.agent.q)
+        q = q.half().float()  # best.pt keeps half precision: fly that
+        recent = self.envs.episodes[-100:] or [drone.episode() for drone in self.envs.drones]
+        flown = {"train": recent, "validation": fly(dqn_pilot(q), VALIDATION, self.envs.world)}
+        row = {"step": self.envs.steps, "episodes": len(self.envs.episodes)}
+        row["epsilon"] = self.agent.epsilon
+        row |= {f"{w}_{k}": float(x.mean()) for w in flown for k, x in measure(flown[w]).items()}
+        row["validation_longer"] = row["validation_steps"] / random_steps(self.envs.world) - 1
+        self.log.append(row | {"seconds": seconds})
+        share = "validation_goal" if self.c.beacon else "validation_crossed"
+        scores = [(row[share], row["validation_progress"]) for row in self.log]
+        if averaged or scores[-1] > max(scores[:-1], default=(-1, 0)):
+            save_weights(self.folder / "best.pt", q, self.c)
+
+    def save(self) -> None:
+        """Write the checkpoint, 34 MB. Of the replay it holds the actions, one byte each."""
+        content = {"config": asdict(self.c), "kind": kind(self.c), "actions": self.envs.actions}
+        content |= {"agent": self.agent.state_dict(), "rng": self.rng.bit_generator.state}
+        content |= {"optimizer": self.agent.optimizer.state_dict(), "log": self.log}
+        save(self.folder / "checkpoint.pt", content | {"forests": self.forests.bit_generator.state})
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Set everything as it was. All actions since the first step are flown again, which puts
+        the same transitions into the replay."""
+        print(f"flying {len(saved['actions']) * self.c.num_envs:,} steps again", flush=True)
+        for actions in saved["actions"]:
+            s = self.envs.reset_done()  # (L, 4, 84, 84)
+            s2, r, terminated, truncated, drones = self.envs.step(actions)
+            r = self.shaped(r, drones)  # (L,)
+            self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
+        if self.forests.bit_generator.state != saved["forests"]:
+            raise InputError(f"{self.folder}: on this machine its episodes end elsewhere")
+        self.agent.load_state_dict(saved["agent"])
+        self.agent.optimizer.load_state_dict(saved["optimizer"])
+        self.rng.bit_generator.state, self.log = saved["rng"], saved["log"]
+        if saved["config"]["steps"] != self.c.steps:
+            self.agent.mean.n_averaged.zero_()  # a longer training averages its own last share
+
 
 @cache
 def random_steps(world: World) -> float:
     """How long random episodes are in the validation forests, in the mean."""
     return float(measure(fly_random(VALIDATION, world))["steps"].mean())
-
-
-@contextmanager
-def stop_signals() -> Iterator[list[int]]:
-    """A list that Ctrl-C, SIGTERM and SIGHUP are written to, so that the running step can end. The
-    same signal again acts at once. One that nohup ignores stays ignored."""
-    stopped: list[int] = []
-
-    def stop(number: int, _frame: object) -> None:
-        stopped.append(number)
-        signal.signal(number, handlers[number])
-        print("\nstopping: this step ends and is saved; again: at once", file=sys.stderr)
-
-    numbers = [getattr(signal, x) for x in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, x)]
-    taken = [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
-    handlers = {number: signal.signal(number, stop) for number in taken}
-    try:
-        yield stopped
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
 
 
 # -------------------------------------------------- eval
@@ -379,7 +358,7 @@ def draw_film(episode: Episode, world: World, q: QNetwork, name: str) -> Iterato
         yield render.draw_panel(s[-1], trunks, np.array(path), drone.outcome, values, action, text)
 
 
-# -------------------------------------------------- files
+# -------------------------------------------------- files, signals: skip on a first reading
 
 
 def atomic_write(path: Path, data: bytes) -> None:
@@ -433,7 +412,28 @@ def kind(c: Config | type[Config]) -> list:
     return [c.pilot, str(torch.__version__), f"bfloat16 {dqn.BFLOAT16}"]
 
 
-# -------------------------------------------------- the command line
+@contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """A list that Ctrl-C, SIGTERM and SIGHUP are written to, so that the running step can end. The
+    same signal again acts at once. One that nohup ignores stays ignored."""
+    stopped: list[int] = []
+
+    def stop(number: int, _frame: object) -> None:
+        stopped.append(number)
+        signal.signal(number, handlers[number])
+        print("\nstopping: this step ends and is saved; again: at once", file=sys.stderr)
+
+    numbers = [getattr(signal, x) for x in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, x)]
+    taken = [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
+    handlers = {number: signal.signal(number, stop) for number in taken}
+    try:
+        yield stopped
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+# -------------------------------------------------- the command line: skip on a first reading
 
 
 class Parser(argparse.ArgumentParser):

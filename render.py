@@ -109,13 +109,15 @@ def raycast(
     """
     radius, camera_of = (np.broadcast_to(x, len(centres)) for x in (radius, camera_of))  # (N,) both
     cos, sin = np.cos(bearings), np.sin(bearings)  # (M,), (M,)
-    along = centres @ np.array([cos, sin])  # (N, M) m: x * cos + y * sin
-    across = np.abs(centres @ np.array([-sin, cos]))  # (N, M) m: y * cos - x * sin
+    across = centres @ np.array([-sin, cos])  # (N, M) m: y * cos - x * sin
+    np.abs(across, out=across)
     hits = np.flatnonzero(across < radius[:, None])  # (H,) cells of the table, counted row by row
-    hits = hits[along.ravel()[hits] > 0]  # (H,) without what is behind the camera
     trunk, ray = np.divmod(hits, len(bearings))  # (H,), (H,) the row and column of each cell
-    half_chord = np.sqrt(radius[trunk] ** 2 - across.ravel()[hits] ** 2)  # (H,) m
-    distance = along.ravel()[hits] - half_chord  # (H,) m
+    along = centres[trunk, 0] * cos[ray] + centres[trunk, 1] * sin[ray]  # (H,) m
+    front = along > 0  # (H,) the others are behind the camera
+    trunk, ray, along, across = trunk[front], ray[front], along[front], across.ravel()[hits[front]]
+    half_chord = np.sqrt(radius[trunk] ** 2 - across**2)  # (H,) m
+    distance = along - half_chord  # (H,) m
     # A painter draws what is far first and what is near over it. In the same way the nearest trunk
     # of a ray is written last here, and stays.
     far_to_near = np.argsort(-distance)  # (H,)

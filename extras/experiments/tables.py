@@ -52,6 +52,20 @@ def markdown(columns: dict[str, tuple[str, str]]) -> str:
     return "\n".join(lines)
 
 
+def seeds() -> str:
+    """The seeds of the recipe in a sentence."""
+    pilots = [read(file)["pilots"][pilot] for file, pilot in SEEDS.values()]
+    arrived, crossed = (
+        ", ".join(f"{100 * pilot[key]['value']:.0f}" for pilot in pilots)
+        for key in ("goal", "crossed")
+    )
+    returns = ", ".join(f"{pilot['return']['value']:.0f}" for pilot in pilots)
+    return (
+        f"Seeds 0, 1 and 2 of `train`: {arrived} % arrived, {crossed} % crossed, "
+        f"returns of {returns}."
+    )
+
+
 def front() -> str:
     """What `eval` prints, from results/eval.json."""
     report, out = read("eval"), io.StringIO()
