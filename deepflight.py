@@ -80,7 +80,7 @@ VALIDATION = range(10**9, 10**9 + 48)
 
 @dataclass(frozen=True)
 class Config(dqn.DQNConfig):
-    """All settings; each is a flag of `train`. [+] is not in the paper."""
+    """All settings; each is a flag of `train`. Here [+] means: not in [DF]."""
 
     seed: int = setting(0, "of everything random", 0, 10**18)
     beacon: bool = setting(False, "[+] put a visible pole at the goal", 0, 1)
@@ -116,9 +116,10 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
 
     A policy is a rule that picks the action. One kind of shaping, called potential-based, leaves
     the best policy as it is [Ng 1999]: it pays gamma * P(s2) - P(s), for any function P of the
-    state. Ours is not of that kind and changes the best policy, on purpose. With P = 2x half a
-    metre forward from x = 50 would be worth 0.99 * 101 - 100 = -0.01, and 0.99 from x = 0, where
-    ours pays 1.0 everywhere. Every return that is printed or logged is the paper's.
+    state, so that along a path its discounted sum depends only on where the path begins and ends.
+    Ours is not of that kind and changes the best policy, on purpose. With P = 2x half a metre
+    forward from x = 50 would be worth 0.99 * 101 - 100 = -0.01, and 0.99 from x = 0, where ours
+    pays 1.0 everywhere. Every return that is printed or logged is the paper's.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     goal = np.array([drone.outcome == "goal" for drone in drones])  # (L,)
@@ -170,7 +171,7 @@ class Run:
                 if dqn.due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
                     seconds = time.perf_counter() - start
                     self.validate(seconds)
-                    table = [self.log[0], *(row.values() for row in self.log)]
+                    table = [self.log[0].keys(), *(row.values() for row in self.log)]
                     text = "".join(",".join(map(str, line)) + "\n" for line in table)
                     atomic_write(folder / "log.csv", text.encode())
                     self.save()
@@ -187,8 +188,8 @@ class Run:
     def validate(self, seconds: float) -> None:
         """Fly the validation forests without exploring, and add a row to the log. best.pt keeps the
         weights of the best score: the share that crossed, and among equals the progress. In the
-        last share of the steps it keeps the mean of the weights instead, whatever its score,
-        because the best of many scores is partly luck."""
+        last tenth of the steps (swa_fraction) it keeps the mean of the weights instead, whatever
+        its score, because the best of many scores is partly luck."""
         averaged = self.agent.mean.n_averaged > 0
         q = copy.deepcopy(self.agent.mean.module if averaged else self.agent.q)
         q = q.half().float()  # best.pt keeps half precision: fly that
@@ -252,7 +253,7 @@ def fly_random(seeds: Sequence[int], world: World) -> list[Episode]:
 
 def evaluate(args: argparse.Namespace, pilots: dict[str, Pilot]) -> int:
     """Fly a network beside other pilots, which see nothing, through the same forests: a table,
-    JSON, and a film of the network's first episode that crossed."""
+    JSON, and a film of the network's first episode that crossed (or of the first)."""
     shipped = Path(__file__).parent / "weights" / ("dqn-beacon.pt" if args.beacon else "dqn.pt")
     q, world, name = load_weights(args.weights or shipped)
     film, seeds = args.out / "flight.gif", range(args.first_seed, args.first_seed + args.episodes)
@@ -305,7 +306,7 @@ def summarize(episodes: list[Episode], baseline: list[Episode], draws: ndarray) 
     forests = draws.shape[1]
     means = {key: x.reshape(-1, forests).mean(0) for key, x in measure(episodes).items()}
     random = measure(baseline)["steps"].reshape(-1, forests).mean(0)  # (forests,)
-    ratios = means["steps"][draws].mean(1) / random[draws].mean(1)  # (2000,)
+    ratios = means["steps"][draws].mean(1) / random[draws].mean(1)  # (2000,) the same forests
     metrics = {"longer": interval(means["steps"].mean() / random.mean() - 1, ratios - 1)}
     for key, x in means.items():
         share = key in ("crossed", *env.OUTCOMES)

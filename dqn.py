@@ -55,8 +55,9 @@ Algorithm 1 of [Mnih15]; `train` carries its numbers:
     15          every C steps reset Q^ = Q
 
 Legend: A actions, B transitions in a batch, L environments side by side, T rows of the replay.
-[+name] marks what is not in the textbook; the setting of that name switches it off. Three
-more are always on: Adam in place of Mnih's RMSprop, bfloat16, and rewards that are not clipped.
+[+name] marks what [Mnih15], our textbook, does not have; the setting of that name switches it off.
+Three more are always on: Adam in place of RMSprop, bfloat16 where the processor knows it, and
+rewards that are not clipped.
 """
 
 import copy
@@ -82,8 +83,8 @@ class InputError(ValueError):
 
 
 def setting(default: Any, text: str, *legal: Any) -> Any:
-    """A field of a configuration: its default, what it is, its least and greatest value (or, of a
-    word, all that it may be)."""
+    """A field of a configuration: its default, what it is, and its least and greatest value, or the
+    allowed words."""
     return field(default=default, metadata={"help": text, "legal": legal})
 
 
@@ -105,7 +106,7 @@ class DQNConfig:
     double: bool = setting(True, "[+] Double DQN [van Hasselt 2016]; --no-double: off", 0, 1)
     n_steps: int = setting(5, "[+] true rewards in a target; 1: off", 1, 100)
     mirror: bool = setting(True, "[+] reflect half of every batch; --no-mirror: off", 0, 1)
-    huber_delta: float = setting(10.0, "[+] larger errors pull no harder; 1: Mnih's", 1e-3, 1e6)
+    huber_delta: float = setting(10.0, "[+] errors beyond pull equally hard; 1: Mnih's", 1e-3, 1e6)
     lr_decay: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
     swa_fraction: float = setting(0.1, "[+] last share of steps, averaged to fly; 0: off", 0, 0.5)
 
@@ -149,8 +150,8 @@ class QNetwork(nn.Module):
     def forward(self, s: Tensor, bfloat16: bool = False) -> Tensor:
         """Q(s, .) (B, A) float32 of s (B, 4, 84, 84) uint8; PyTorch calls this for q(s).
 
-        Even with bfloat16 the last layers stay float32, because values near 100 are common here,
-        where bfloat16 has steps of 0.5 and actions would tie.
+        Even with bfloat16 the last layers stay float32. Values near 100 are common here, where
+        bfloat16 has steps of 0.5, so actions would tie. Acting uses float32 throughout.
         """
         grey = s.to(torch.bfloat16 if bfloat16 else torch.float32).div_(255)  # (B, 4, 84, 84) 0..1
         with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
@@ -232,7 +233,8 @@ class Replay:
         """Draw transitions uniformly.
 
         The oldest three rows are left out, because the frames before them may be overwritten. The
-        newest n rows are left out, because their s2 is not there yet.
+        newest n rows are left out, because their s2 is not there yet. In the drawing above, row 7
+        is written next. With n = 2, rows 7, 8 and 9 and rows 5 and 6 are left out.
         """
         oldest = max(self.added - self.rows, 0) + 3
         row = rng.integers(oldest, self.added - n, size) % self.rows  # (B,)
@@ -244,12 +246,13 @@ class Replay:
 
         [+n_steps] With n = 2 the target of Q(s_0, a_0) is r_0 + gamma * r_1 + gamma^2 * (the
         greatest Q^ of s_2): two true rewards, so the truth moves back by two steps in each update.
-        This has a price. r_1 followed from the action in s_1, which an older agent chose and which
-        may not have been the best one, so this target is not quite off-policy and rather too low.
+        This has a price: r_1 followed from the action in s_1, which an older agent chose. At best
+        it was the best action, so such a target is usually too low.
         """
         rows, envs = (row[:, None] + np.arange(n)) % self.rows, env[:, None]  # (B, n), (B, 1)
         live = self.ends[rows, envs] == LIVE  # (B, n)
-        # Reward k counts if none of the steps 0 to k - 1 ended the episode: 1, otherwise 0.
+        # Reward k counts if none of the steps 0 to k - 1 ended the episode: 1, otherwise 0. In the
+        # example of the class, row 1 with n = 3: live 1 0 1, reached 1 1 0, count 2, last row 2.
         reached = np.ones((len(row), n), np.float32)  # (B, n)
         reached[:, 1:] = np.cumprod(live[:, :-1], 1)
         discounts = np.float32(gamma) ** np.arange(n, dtype=np.float32)  # (n,)
@@ -295,9 +298,9 @@ class Agent(nn.Module):
 
     Adam keeps two running means for each weight: m of its gradient g, and v of g^2. A running mean
     goes a small part of the way to each new number: m = 0.9 * m + 0.1 * g. The weight moves by
-    -lr * m / (sqrt(v) + eps), so all weights move about equally fast, except those with tiny
-    gradients. (Adam also corrects for m and v starting at 0.) Rainbow's eps is 1.5e-4 [Hessel
-    2018]. Gradients grow with huber_delta, so our eps does too: it is ten times as large.
+    -lr * m / (sqrt(v) + eps), so all weights move about equally fast. (Adam also corrects for m and
+    v starting at 0.) Only weights with tiny gradients move less, because of eps. Rainbow has 1.5e-4
+    [Hessel 2018]. Gradients grow with huber_delta, so our eps does too: it is ten times as large.
     """
 
     def __init__(self, c: DQNConfig, actions: int, rng: Generator) -> None:
@@ -402,7 +405,7 @@ def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator
     replay = Replay(c.replay_size, c.num_envs)  # 1
     agent = Agent(c, envs.num_actions, rng)  # 2, 3
     yield agent, replay
-    # step: the number of control steps after this pass
+    # step: the number of control steps after this pass; a restored run begins at envs.steps > 0
     for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):  # 4
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]

@@ -31,7 +31,7 @@ made: 1 - 60 / 90 = 0.33. The reward of the step is -1.67.
 One flight from the start to its end is an **episode**. It is **terminated** when the world ends it:
 by a crash, at the goal, or outside the forest. No more reward can follow. It is **truncated** when
 only the clock ends it, after 1,000 steps: the drone was still flying, and more reward would have
-followed. A learner must keep the two apart, or it learns that late moments are bad.
+followed. A learner must keep the two apart, or it learns that nothing follows a late moment.
 
 The drone sees its last four frames, an **observation**. That is less than the whole state of the
 world: the frames do not show which edge of the forest is the far one, or what stands behind the
@@ -83,7 +83,7 @@ class World(Scene):
     speed: float = 5.0  # m/s, authors' simulator
     dt: float = 0.1  # s, one control step: ours
     yaw_rate: float = 0.7  # rad/s, the sharpest turn [DF §II-A]
-    actions: int = 9  # yaw rates from -0.7 (right) to +0.7 (left), at most 10 [DF §II-A]
+    actions: int = 9  # yaw rates from -0.7 (right) to +0.7 (left) [DF §II-A]
     laser_range: float = 20.0  # m, authors' simulator
     d_neg: float = 2.0  # m, this and the next four: [DF §II-A]
     d_crash: float = 0.75  # m
@@ -96,7 +96,7 @@ class World(Scene):
 
     def __post_init__(self) -> None:
         if self.speed * self.dt >= self.trunk_radius + self.d_crash:
-            raise ValueError(f"speed {self.speed} m/s: the drone would step over a trunk's middle")
+            raise ValueError(f"speed {self.speed} m/s: a step could jump through a trunk unseen")
 
 
 def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
@@ -190,7 +190,7 @@ class Drone:
         return OUTCOMES[ended.index(True)] if any(ended) else ""
 
     def episode(self) -> Episode:
-        """The episode so far: seed, actions as digits, and what came of them."""
+        """The episode so far: seed, actions as one digit each, and what came of them."""
         flown = {"seed": self.seed, "actions": "".join(map(str, self.actions))}
         flown |= {"outcome": self.outcome, "steps": len(self.actions)}
         return flown | {"progress": self.progress, "return": self.total}
@@ -220,6 +220,7 @@ class VecForest:
 
     def reset_done(self) -> ndarray:
         """Begin an episode where none is active; returns all observations (E, 4, 84, 84) uint8."""
+        # Drones come first in this zip, because it takes from the second only after the first.
         for drone, seed in zip([d for d in self.drones if d.outcome], self.seeds, strict=False):
             drone.reset(seed)
         begun = [drone for drone in self.active if not drone.actions]

@@ -66,7 +66,7 @@ from PIL import Image, ImageDraw
 PIXELS = 84  # height and width of a frame [DF §II-A]
 CENTRE = (PIXELS - 1) / 2  # px: the optical axis meets the frame between its two middle pixels
 FOCAL = PIXELS / 2  # px: half the frame spans 45 degrees (ours)
-SLOPES = (CENTRE - np.arange(PIXELS)) / FOCAL  # (84,) of column i to the left, of row i upwards
+SLOPES = (CENTRE - np.arange(PIXELS)) / FOCAL  # (84,) of column i, left is positive; of row i, up
 BEARINGS = np.arctan(SLOPES)  # (84,) rad, counter-clockwise from straight ahead
 COSINES = np.cos(BEARINGS)  # (84,) depth for each metre along a ray
 ROWS = np.arange(PIXELS, dtype=np.uint8)[:, None]  # (84, 1)
@@ -99,8 +99,9 @@ def raycast(
 ) -> tuple[ndarray, ndarray]:  # fmt: skip
     """Find what each ray of each camera hits first. Cameras must stand outside all trunks.
 
-    The trunks of all cameras are in one list. centres (N, 2): m, from the camera that sees the
-    trunk. camera_of (N,): which camera that is. radius: m, one, or (N,). bearings (M,): rad.
+    The trunks of all cameras are in one list. centres (N, 2): how far ahead and to the left of its
+    camera each trunk stands, m. camera_of (N,): which camera that is. radius: m, one, or (N,).
+    bearings (M,): rad.
     Returns the distance (E, M) in m along each ray, inf where it hits nothing, and the cosine
     (E, M) of the angle of incidence, 0 where it hits nothing.
 
@@ -115,9 +116,9 @@ def raycast(
     trunk, ray = np.divmod(hits, len(bearings))  # (H,), (H,) the row and column of each cell
     along = centres[trunk, 0] * cos[ray] + centres[trunk, 1] * sin[ray]  # (H,) m
     front = along > 0  # (H,) the others are behind the camera
-    trunk, ray, along, across = trunk[front], ray[front], along[front], across.ravel()[hits[front]]
-    half_chord = np.sqrt(radius[trunk] ** 2 - across**2)  # (H,) m
-    distance = along - half_chord  # (H,) m
+    trunk, ray = trunk[front], ray[front]  # (H,), (H,)
+    half_chord = np.sqrt(radius[trunk] ** 2 - across[trunk, ray] ** 2)  # (H,) m
+    distance = along[front] - half_chord  # (H,) m
     # A painter draws what is far first and what is near over it. In the same way the nearest trunk
     # of a ray is written last here, and stays.
     far_to_near = np.argsort(-distance)  # (H,)
@@ -133,7 +134,8 @@ def shade(grey: ndarray | float, haze: ndarray | float, depth: ndarray, scene: S
 
     The grey camera mixes a grey level with the sky's: the more metres of haze, the more sky, and
     nothing but sky where the view ends. A stereo camera has two lenses side by side, which see a
-    point in columns that differ by focal length * baseline / depth. That is the disparity.
+    point in columns that differ by focal length * baseline / depth. That is the disparity, and
+    255 * near stands for focal length * baseline.
 
     >>> shade(0, 0, np.array([1.0, 2.0, 4.0, np.inf]), Scene(camera="disparity"))
     array([255. , 255. , 127.5,   0. ])
