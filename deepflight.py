@@ -162,6 +162,9 @@ class Run:
                 import fcntl
 
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            there = folder / "checkpoint.pt"
+            if there.exists() and load(there, "actions")["actions"] != envs.actions:
+                raise BlockingIOError  # somebody went on with it while our steps were flown again
             atomic_write(folder / "config.json", json.dumps(asdict(c), indent=2).encode())
             self.save()
             print(f"to {folder}: {c.steps:,} steps, {c.num_envs} at a time\n\n{HEAD}", flush=True)
@@ -262,7 +265,8 @@ def evaluate(args: argparse.Namespace, pilots: dict[str, Pilot]) -> int:
     torch.set_num_threads(args.threads)
     for path in (film, args.json or film):  # better to fail now than after all episodes
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.open("ab").close()
+        if path.is_dir() or not os.access(path.parent, os.W_OK):
+            raise InputError(f"{path} cannot be written")
     print(f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n", flush=True)
     flown = {"random": fly_random(seeds, world)}
     others = {"straight": env.straight_pilot, **pilots, name: dqn_pilot(q)}
@@ -422,7 +426,6 @@ def stop_signals() -> Iterator[list[int]]:
     def stop(number: int, _frame: object) -> None:
         stopped.append(number)
         signal.signal(number, handlers[number])
-        print("\nstopping: this step ends and is saved; again: at once", file=sys.stderr)
 
     numbers = [getattr(signal, x) for x in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, x)]
     taken = [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]

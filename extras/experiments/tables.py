@@ -24,10 +24,7 @@ FRONT = {  # heading -> file, pilot
     "imitation": ("imitation", "imitation"),
     "imitation, beacon": ("imitation-beacon", "imitation"),
 }
-FULL = FRONT | {
-    "imitation, disparity": ("imitation-disparity", "imitation"),
-    "laser": ("imitation", "laser"),
-}
+FULL = FRONT | {"laser": ("imitation", "laser")}
 SEEDS = {f"seed {i}": (name, "dqn") for i, name in enumerate(("dqn", "dqn-1", "dqn-2"))}
 
 
