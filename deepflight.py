@@ -112,11 +112,12 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     1.25 in its own step, and then 0.99 * 125.
     far_bonus: no frame shows which edge is the far one, so a drone that leaves does not know
     whether it gets -10 or 188. The bonus makes this risk worth taking; 200 was found by trial. It
-    changes the task, because the paper counts the far edge as a crash: compare by "arrived".
+    changes the task: the paper counts the far edge as a crash, and here it is worth more than
+    arrival. So compare by "arrived".
 
     A policy is a rule that picks the action. One kind of shaping, called potential-based, leaves
     the best policy as it is [Ng 1999]: it pays gamma * P(s2) - P(s), for any function P of the
-    state, so that along a path its discounted sum depends only on where the path begins and ends.
+    state, so that along a path it adds up to gamma^T P(end) - P(start), whatever lies between.
     Ours is not of that kind and changes the best policy, on purpose. With P = 2x half a metre
     forward from x = 50 would be worth 0.99 * 101 - 100 = -0.01, and 0.99 from x = 0, where ours
     pays 1.0 everywhere. Every return that is printed or logged is the paper's.
@@ -190,9 +191,9 @@ class Run:
 
     def validate(self, seconds: float) -> None:
         """Fly the validation forests without exploring, and add a row to the log. best.pt keeps the
-        weights of the best score: the share that crossed, and among equals the progress. In the
-        last tenth of the steps (swa_fraction) it keeps the mean of the weights instead, whatever
-        its score, because the best of many scores is partly luck."""
+        weights of the best score: the share that crossed (with the beacon: arrived), then the
+        progress. In the last tenth of the steps (swa_fraction) it keeps the mean of the weights
+        instead, whatever its score, because the best of many scores is partly luck."""
         averaged = self.agent.mean.n_averaged > 0
         q = copy.deepcopy(self.agent.mean.module if averaged else self.agent.q)
         q = q.half().float()  # best.pt keeps half precision: fly that
@@ -225,7 +226,7 @@ class Run:
             r = self.shaped(r, drones)  # (L,)
             self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
         if self.forests.bit_generator.state != saved["forests"]:
-            raise InputError(f"{self.folder}: on this machine its episodes end elsewhere")
+            raise InputError(f"{self.folder}: its actions lead to other episodes on this machine")
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state, self.log = saved["rng"], saved["log"]

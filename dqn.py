@@ -35,8 +35,7 @@ The truth moves backwards. Three things can go wrong, and DQN has an answer to e
   * An agent that always does what seems best never finds what is better. So it **explores**: with
     probability epsilon, at first 1 and later 0.05, its action is random (an exploration schedule).
 
-Algorithm 1 of [Mnih15]; `train` carries its numbers:
-
+Algorithm 1 of [Mnih15], whose numbers `train` carries:
      1  initialize replay memory D to capacity N
      2  initialize action-value function Q with random weights theta
      3  initialize target action-value function Q^ with weights theta- = theta
@@ -54,10 +53,10 @@ Algorithm 1 of [Mnih15]; `train` carries its numbers:
     14          perform a gradient descent step on (y_j - Q(phi_j, a_j; theta))^2 w.r.t. theta
     15          every C steps reset Q^ = Q
 
-Legend: A actions, B transitions in a batch, L environments side by side, T rows of the replay.
-[+name] marks what [Mnih15], our textbook, does not have; the setting of that name switches it off.
-Three more are always on: Adam in place of RMSprop, bfloat16 where the processor knows it, and
-rewards that are not clipped.
+Legend: phi(s) last four frames, theta weights; A actions, B transitions in a batch, L environments
+side by side, T rows of the replay. A pass is one control step of all environments. [+name] marks
+what our textbook [Mnih15] does not have; the setting of that name switches it off. Three more are
+always on: Adam, bfloat16 where the processor knows it, and rewards that are not clipped.
 """
 
 import copy
@@ -294,7 +293,10 @@ def mirror(b: Batch, actions: int, rng: Generator) -> Batch:
 
 
 class Agent(nn.Module):
-    """What learning changes: Q, the target network Q^, the optimizer, the mean of Q's weights.
+    """What learning changes: Q, the target network Q^, the optimizer, and the mean of Q's weights.
+
+    [+swa_fraction] One update changes how Q flies, and the mean of the weights after each of many
+    updates hardly changes (stochastic weight averaging). So the mean is what flies in the end.
 
     Adam keeps two running means for each weight: m of its gradient g, and v of g^2. A running mean
     goes a small part of the way to each new number: m = 0.9 * m + 0.1 * g. The weight moves by
@@ -353,7 +355,7 @@ def learn(agent: Agent, b: Batch, c: DQNConfig) -> None:
         y = td_target(b, q2, q2_online)  # 13 (B,)
     q_sa = agent.q(b.s, BFLOAT16).gather(1, b.a[:, None])[:, 0]  # (B,) Q of the actions taken
     loss = nn.functional.huber_loss(q_sa, y, delta=c.huber_delta)  # 14 [+huber_delta]
-    agent.optimizer.zero_grad()
+    agent.optimizer.zero_grad()  # backward() adds to what is there
     loss.backward()
     agent.optimizer.step()
     agent.loss = loss.item()
@@ -420,7 +422,7 @@ def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator
             batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
             batch = mirror(batch, envs.num_actions, rng) if c.mirror else batch  # [+mirror]
             learn(agent, batch, c)  # 13, 14
-            if step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction] a mean is steadier to fly
+            if step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction]
                 agent.mean.update_parameters(agent.q)
         if due(c.target_every, step, c.num_envs):
             agent.q_target.load_state_dict(agent.q.state_dict())  # 15

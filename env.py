@@ -46,7 +46,7 @@ Legend
     d_max     m, the forest's length
     psi       rad, the heading
     N         trunks
-    E         drones side by side whose episodes have not ended: the active ones
+    E         drones side by side that are active: their episodes have not ended before the step
     [DF]      the Deep Flight paper; "authors' simulator" is the code released with it
     ours      a number that neither gives
 
@@ -220,7 +220,7 @@ class VecForest:
 
     def reset_done(self) -> ndarray:
         """Begin an episode where none is active; returns all observations (E, 4, 84, 84) uint8."""
-        # Drones come first in this zip, because it takes from the second only after the first.
+        # Drones come first in this zip, or it would take a seed too many and lose it.
         for drone, seed in zip([d for d in self.drones if d.outcome], self.seeds, strict=False):
             drone.reset(seed)
         begun = [drone for drone in self.active if not drone.actions]

@@ -16,12 +16,12 @@ is needed. A camera is 84 rays.
 
 Where does a ray meet a trunk?
 
-                    . - .
-                  /       \         along       from the camera to p, the ray's nearest point to
-   camera ------ # --- p - |--->                the trunk's centre c
-                 |     |   |        across      from p to c
-                  \    c  /         half_chord  from the surface # to p
-                    ' - '           radius      from the surface # to c
+                   .-~~~-.
+    camera ------ # --p-- `------>   along       from the camera to p, the ray's nearest point to
+                 /    |    \                     the trunk's centre c
+                |     c     |        across      from p to c
+                 \         /         half_chord  from the surface # to p
+                  `-.....-'          radius      from the surface # to c
 
     half_chord = sqrt(radius^2 - across^2)      by Pythagoras, if across < radius
     distance   = along - half_chord             from the camera to the surface
@@ -113,7 +113,7 @@ def raycast(
     across = centres @ np.array([-sin, cos])  # (N, M) m: y * cos - x * sin
     np.abs(across, out=across)
     hits = np.flatnonzero(across < radius[:, None])  # (H,) cells of the table, counted row by row
-    trunk, ray = np.divmod(hits, len(bearings))  # (H,), (H,) the row and column of each cell
+    trunk, ray = np.divmod(hits, len(bearings))  # (H,), (H,) row and column of each cell
     along = centres[trunk, 0] * cos[ray] + centres[trunk, 1] * sin[ray]  # (H,) m
     front = along > 0  # (H,) the others are behind the camera
     trunk, ray = trunk[front], ray[front]  # (H,), (H,)
@@ -132,10 +132,10 @@ def raycast(
 def shade(grey: ndarray | float, haze: ndarray | float, depth: ndarray, scene: Scene) -> ndarray:
     """The value of a pixel, 0 to 255. depth: m, of what it shows.
 
-    The grey camera mixes a grey level with the sky's: the more metres of haze, the more sky, and
-    nothing but sky where the view ends. A stereo camera has two lenses side by side, which see a
-    point in columns that differ by focal length * baseline / depth. That is the disparity, and
-    255 * near stands for focal length * baseline.
+    haze: m of air in front of it; 0 where it always looks clear. The grey camera mixes a grey level
+    with the sky's: the more haze, the more sky, and nothing but sky where the view ends. A stereo
+    camera has two lenses side by side, which see a point in columns that differ by focal length *
+    baseline / depth. That is the disparity, and 255 * near stands for focal length * baseline.
 
     >>> shade(0, 0, np.array([1.0, 2.0, 4.0, np.inf]), Scene(camera="disparity"))
     array([255. , 255. , 127.5,   0. ])
@@ -181,7 +181,7 @@ def camera(
     seen = np.concatenate([seen_from(*pair) for pair in zip(poses, trunks, strict=True)])  # (N, 2)
     ahead, left = seen.T  # (N,), (N,) m
     # Keep what may be in view: between the frame's edges at 45 degrees, with two radii to spare
-    # because a trunk is wide.
+    # because a trunk is wide (sqrt(2) of them would do).
     in_view = (ahead > 0) & (ahead < scene.view) & (np.abs(left) < ahead + 2 * scene.trunk_radius)
     visible = seen[in_view], scene.trunk_radius, BEARINGS, camera_of[in_view], len(poses)
     distance, cosine = raycast(*visible)  # (E, 84), (E, 84)

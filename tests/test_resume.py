@@ -142,7 +142,7 @@ def test_what_does_not_fit_a_checkpoint_is_refused(
         ("", Small, whole.folder, "has flown 400 steps"),
         ("--steps 200", Small, whole.folder, "has flown 400 steps"),
         ("--steps 480", Other, whole.folder, "is of kind ['dqn'"),
-        ("--steps 480", Small, tmp_path, "its episodes end elsewhere"),
+        ("--steps 480", Small, tmp_path, "other episodes on this machine"),
     ):
         assert main(["train", "--resume", str(folder), *words.split()], config) == 2
         error = capsys.readouterr().err
