@@ -157,7 +157,7 @@ class Run:
     def go(self) -> int:
         """Train, validate, log, save, until the last step or a signal; returns the exit code."""
         envs, c, folder = self.envs, self.c, self.folder
-        start = time.perf_counter() - (self.log[-1]["seconds"] if self.log else 0)
+        began = time.perf_counter() - (self.log[-1]["seconds"] if self.log else 0)
         with (folder / ".lock").open("w") as file, stop_signals() as stopped:
             with suppress(ImportError):  # Windows: nothing keeps a second training out
                 import fcntl
@@ -173,7 +173,7 @@ class Run:
                 if not math.isfinite(self.agent.loss):
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")
                 if dqn.due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
-                    seconds = time.perf_counter() - start
+                    seconds = time.perf_counter() - began
                     self.validate(seconds)
                     table = [self.log[0].keys(), *(row.values() for row in self.log)]
                     text = "".join(",".join(map(str, line)) + "\n" for line in table)
@@ -298,7 +298,7 @@ def measure(episodes: list[Episode]) -> dict[str, ndarray]:
     table = {key: np.array([e[key] for e in episodes]) for key in ("steps", "progress", "return")}
     outcome = np.array([episode["outcome"] for episode in episodes])  # (F,)
     table["crossed"] = np.isin(outcome, ("goal", "far"))
-    return table | {kind: outcome == kind for kind in env.OUTCOMES}
+    return table | {name: outcome == name for name in env.OUTCOMES}
 
 
 def summarize(episodes: list[Episode], baseline: list[Episode], draws: ndarray) -> dict[str, dict]:
@@ -337,17 +337,17 @@ def wilson(p: float, n: int) -> dict[str, float]:
     return {"value": float(p), "low": max(middle - half, 0.0), "high": min(middle + half, 1.0)}
 
 
-TABLE = {"goal": "arrived, %", "crossed": "crossed, %", "crash": "crashed, %", "steps": "steps",
+TABLE = {"goal": "arrived, %", "crossed": "crossed, %", "crash": "hit a trunk, %", "steps": "steps",
          "longer": "longer, %", "return": "return"}  # fmt: skip
 
 
 def print_table(metrics: dict[str, dict]) -> None:
     """One row a metric, one column a pilot."""
-    print(f"{'':10}" + "".join(f"{name:>17}" for name in metrics))
+    print(f"{'':14}" + "".join(f"{name:>17}" for name in metrics))
     for key, label in TABLE.items():
         factor = 100 if "%" in label else 1
         cells = [[f"{factor * x:z.0f}" for x in metrics[name][key].values()] for name in metrics]
-        print(f"{label:10}" + "".join(f"{f'{x} [{low}, {high}]':>17}" for x, low, high in cells))
+        print(f"{label:14}" + "".join(f"{f'{x} [{low}, {high}]':>17}" for x, low, high in cells))
 
 
 @torch.no_grad()
@@ -360,7 +360,7 @@ def draw_film(episode: Episode, world: World, q: QNetwork, name: str) -> Iterato
         values = q(torch.from_numpy(s)[None])[0].numpy()  # (A,)
         text = f"{name}: {t * world.dt:.1f} s, {drone.d_goal:.1f} m to the goal\n"
         text += f"reward so far {drone.total:.1f}   {drone.outcome}\n"
-        text += f"bars: {'Q' if name == 'dqn' else 'score'} of each turn, left to right"
+        text += f"bars: {'score' if name == 'imitation' else 'Q'} of each turn, left to right"
         yield render.draw_panel(s[-1], trunks, np.array(path), drone.outcome, values, action, text)
 
 

@@ -422,7 +422,7 @@ def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator
             batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
             batch = mirror(batch, envs.num_actions, rng) if c.mirror else batch  # [+mirror]
             learn(agent, batch, c)  # 13, 14
-            if step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction]
+            if c.swa_fraction and step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction]
                 agent.mean.update_parameters(agent.q)
         if due(c.target_every, step, c.num_envs):
             agent.q_target.load_state_dict(agent.q.state_dict())  # 15

@@ -15,7 +15,7 @@ import deepflight
 
 ROOT = Path(__file__).resolve().parents[2]
 LABELS = {
-    "goal": "arrived, %", "crossed": "crossed, %", "crash": "crashed, %",
+    "goal": "arrived, %", "crossed": "crossed, %", "crash": "hit a trunk, %",
     "longer": "longer than random, %", "return": "return",
 }  # fmt: skip
 FRONT = {  # heading -> file, pilot

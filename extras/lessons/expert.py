@@ -344,7 +344,7 @@ def train(c: DemoConfig, envs: VecForest, rng: Generator, shaped: Callable) -> I
         for _ in range(updates):
             batch = sample(replay, demo_replay, c, rng)  # 12 [!]
             learn(agent, batch, c)  # 13, 14
-            if step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction]
+            if c.swa_fraction and step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction]
                 agent.mean.update_parameters(agent.q)
         if due(c.target_every, step, c.num_envs):
             agent.q_target.load_state_dict(agent.q.state_dict())  # 15

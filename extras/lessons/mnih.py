@@ -78,6 +78,7 @@ def main() -> int:
     """The command line of deepflight.py."""
     if sys.argv[1:2] == ["textbook"]:
         return deepflight.main(sys.argv[2:], TextbookConfig)
+    dqn.BFLOAT16 = False  # here too, because a checkpoint that goes on must have the same
     return deepflight.main(sys.argv[1:], MnihConfig, train)
 
 
