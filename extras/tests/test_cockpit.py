@@ -233,7 +233,12 @@ def test_a_moment_after_the_episode_gets_400(server: Server) -> None:
 def cockpit(*flags: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "extras.cockpit", *flags]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, cwd=ROOT, **pipes)
+    # A child inherits an ignored signal, as under nohup. Here it must hear Ctrl-C.
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(command, cwd=ROOT, **pipes)
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 def test_ctrl_c_ends_it_in_a_line() -> None:
