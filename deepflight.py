@@ -352,7 +352,7 @@ def print_table(metrics: dict[str, dict]) -> None:
 
 @torch.no_grad()
 def draw_film(episode: Episode, world: World, q: QNetwork, name: str) -> Iterator[Any]:
-    """The pictures of an episode: frame, path, and what Q says of each action."""
+    """The pictures of an episode: frame, path, and what the network says of each action."""
     trunks, path = env.plant(episode["seed"], world), []
     for t, (s, drone) in enumerate(env.refly(episode, world)):
         path.append(drone.pose[:2])
