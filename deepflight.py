@@ -52,17 +52,15 @@ import io
 import json
 import math
 import os
-import shlex
 import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, fields
-from functools import cache, partial
-from itertools import count, takewhile
+from itertools import count
 from pathlib import Path
-from typing import Any, ClassVar, NoReturn
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -80,7 +78,7 @@ VALIDATION = range(10**9, 10**9 + 48)
 
 @dataclass(frozen=True)
 class Config(dqn.DQNConfig):
-    """All settings; each is a flag of `train`. Here [+] means: not in [DF]."""
+    """All settings; each is a flag of `train`. [+] marks what is ours, as in dqn.py."""
 
     seed: int = setting(0, "of everything random", 0, 10**18)
     beacon: bool = setting(False, "[+] put a visible pole at the goal", 0, 1)
@@ -90,7 +88,12 @@ class Config(dqn.DQNConfig):
     goal_bonus: float = setting(125.0, "[+] for arrival at the goal; 0: off", 0, 1e6)
     far_bonus: float = setting(200.0, "[+] for leaving by the far edge; 0: off", 0, 1e6)
 
+    # What follows is no setting, but a lesson in extras/ may change it.
+    train: ClassVar[Callable] = staticmethod(dqn.train)
+    network: ClassVar[type] = QNetwork
     pilot: ClassVar[str] = "dqn"  # what the trained network is called
+    command: ClassVar[str] = "python deepflight.py"
+    baselines: ClassVar[dict[str, Pilot]] = {"straight": env.straight_pilot}
     validate_every: ClassVar[int] = 5_000  # control steps
     # With the beacon the goal can be seen, so arrival should be worth more than the far edge.
     beacon_recipe: ClassVar[dict] = {"steps": 400_000, "forward_reward": 0.0, "far_bonus": 50.0}
@@ -123,10 +126,10 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     pays 1.0 everywhere. Every return that is printed or logged is the paper's.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
-    goal = np.array([drone.outcome == "goal" for drone in drones])  # (L,)
-    far = np.array([drone.outcome == "far" for drone in drones])  # (L,)
+    worth = {"goal": c.goal_bonus, "far": c.far_bonus}
+    bonus = np.array([worth.get(drone.outcome, 0.0) for drone in drones])  # (L,)
     # [+forward_reward] [+goal_bonus] [+far_bonus]
-    return r + c.forward_reward * forward + c.gamma * (c.goal_bonus * goal + c.far_bonus * far)
+    return r + c.forward_reward * forward + c.gamma * bonus
 
 
 # -------------------------------------------------- train: what stands around the loop of dqn.py
@@ -138,54 +141,41 @@ ROW += " {validation_crash:6.0%}"
 
 
 class Run:
-    """One training: the loop, and all that must be saved to go on with it."""
+    """One training: the loop of dqn.py, and all that must be saved to go on with it."""
 
-    def __init__(self, train: Callable, c: Config, folder: Path, saved: dict | None = None) -> None:
-        """saved: the checkpoint to go on with."""
+    def __init__(self, c: Config, folder: Path, saved: dict | None = None) -> None:
+        """saved: the checkpoint of a training to go on with."""
         torch.set_num_threads(c.threads)
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log = c, folder, []
         self.rng, self.forests = np.random.default_rng(c.seed), np.random.default_rng([c.seed, 1])
         seeds = (int(self.forests.integers(TRAIN_END)) for _ in count())
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
-        self.shaped = partial(shaped_reward, c=c)
-        self.loop = train(c, self.envs, self.rng, self.shaped)
+        random = fly_random(VALIDATION, self.envs.world)
+        self.random_steps = float(measure(random)["steps"].mean())
+        self.loop = c.train(c, self.envs, self.rng, shaped_reward)
         self.agent, self.replay = next(self.loop)
         if saved:
             self.restore(saved)
 
     def go(self) -> int:
-        """Train, validate, log, save, until the last step or a signal; returns the exit code."""
-        envs, c, folder = self.envs, self.c, self.folder
+        """Train, validate, log and save, until the last step or a signal; returns the exit code."""
+        envs, c = self.envs, self.c
         began = time.perf_counter() - (self.log[-1]["seconds"] if self.log else 0)
-        with (folder / ".lock").open("w") as file, stop_signals() as stopped:
-            with suppress(ImportError):  # Windows: nothing keeps a second training out
-                import fcntl
-
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            there = folder / "checkpoint.pt"
-            if there.exists() and load(there, "actions")["actions"] != envs.actions:
-                raise BlockingIOError  # somebody went on with it while our steps were flown again
-            atomic_write(folder / "config.json", json.dumps(asdict(c), indent=2).encode())
-            self.save()
-            print(f"to {folder}: {c.steps:,} steps, {c.num_envs} at a time\n\n{HEAD}", flush=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        atomic_write(self.folder / "config.json", json.dumps(asdict(c), indent=2).encode())
+        with stop_signals() as stopped:
+            print(f"{self.folder}: {c.steps:,} steps, {c.num_envs} at a time\n\n{HEAD}", flush=True)
             for _ in self.loop:
                 if not math.isfinite(self.agent.loss):
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")
                 if dqn.due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
-                    seconds = time.perf_counter() - began
-                    self.validate(seconds)
-                    table = [self.log[0].keys(), *(row.values() for row in self.log)]
-                    text = "".join(",".join(map(str, line)) + "\n" for line in table)
-                    atomic_write(folder / "log.csv", text.encode())
+                    self.validate(time.perf_counter() - began)
                     self.save()
-                    left, speed = (c.steps / envs.steps - 1) * seconds / 60, envs.steps / seconds
-                    print(ROW.format(**self.log[-1], left=left, speed=speed), flush=True)
                 if stopped and envs.steps < c.steps:
                     self.save()
-                    typed = takewhile(lambda word: word != "train", sys.orig_argv)
-                    command = shlex.join([*typed, "train", "--resume", str(folder)])
-                    print(f"saved at step {envs.steps:,}; to go on:\n{command}", file=sys.stderr)
+                    print(f"saved at step {envs.steps:,}; to go on:", file=sys.stderr)
+                    print(f"{c.command} train --resume '{self.folder}'", file=sys.stderr)
                     return 128 + stopped[0]
         return 0
 
@@ -194,27 +184,34 @@ class Run:
         weights of the best score: the share that crossed (with the beacon: arrived), then the
         progress. In the last tenth of the steps (swa_fraction) it keeps the mean of the weights
         instead, whatever its score, because the best of many scores is partly luck."""
-        averaged = self.agent.mean.n_averaged > 0
-        q = copy.deepcopy(self.agent.mean.module if averaged else self.agent.q)
-        q = q.half().float()  # best.pt keeps half precision: fly that
-        recent = self.envs.episodes[-100:] or [drone.episode() for drone in self.envs.drones]
-        flown = {"train": recent, "validation": fly(dqn_pilot(q), VALIDATION, self.envs.world)}
-        row = {"step": self.envs.steps, "episodes": len(self.envs.episodes)}
-        row["epsilon"] = self.agent.epsilon
+        envs, averaged = self.envs, self.agent.mean.n_averaged > 0
+        q = self.agent.mean.module if averaged else self.agent.q
+        q = copy.deepcopy(q).half().float()  # best.pt keeps half precision: fly that
+        recent = envs.episodes[-100:] or [drone.episode() for drone in envs.drones]
+        flown = {"train": recent, "validation": fly(dqn_pilot(q), VALIDATION, envs.world)}
+        row = {"step": envs.steps, "episodes": len(envs.episodes), "epsilon": self.agent.epsilon}
         row |= {f"{w}_{k}": float(x.mean()) for w in flown for k, x in measure(flown[w]).items()}
-        row["validation_longer"] = row["validation_steps"] / random_steps(self.envs.world) - 1
+        row["validation_longer"] = row["validation_steps"] / self.random_steps - 1
         self.log.append(row | {"seconds": seconds})
         share = "validation_goal" if self.c.beacon else "validation_crossed"
         scores = [(row[share], row["validation_progress"]) for row in self.log]
         if averaged or scores[-1] > max(scores[:-1], default=(-1, 0)):
             save_weights(self.folder / "best.pt", q, self.c)
+        lines = [self.log[0], *(row.values() for row in self.log)]  # a dict's keys are the head
+        text = "".join(",".join(map(str, line)) + "\n" for line in lines)
+        atomic_write(self.folder / "log.csv", text.encode())
+        left, speed = (self.c.steps / envs.steps - 1) * seconds / 60, envs.steps / seconds
+        print(ROW.format(**self.log[-1], left=left, speed=speed), flush=True)
 
     def save(self) -> None:
         """Write the checkpoint, 34 MB. Of the replay it holds the actions, one byte each."""
-        content = {"config": asdict(self.c), "kind": kind(self.c), "actions": self.envs.actions}
-        content |= {"agent": self.agent.state_dict(), "rng": self.rng.bit_generator.state}
-        content |= {"optimizer": self.agent.optimizer.state_dict(), "log": self.log}
-        save(self.folder / "checkpoint.pt", content | {"forests": self.forests.bit_generator.state})
+        content = {
+            "config": asdict(self.c), "kind": kind(self.c), "log": self.log,
+            "actions": self.envs.history, "forests": self.forests.bit_generator.state,
+            "agent": self.agent.state_dict(), "optimizer": self.agent.optimizer.state_dict(),
+            "rng": self.rng.bit_generator.state,
+        }  # fmt: skip
+        save(self.folder / "checkpoint.pt", content)
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Set everything as it was. All actions since the first step are flown again, which puts
@@ -223,7 +220,7 @@ class Run:
         for actions in saved["actions"]:
             s = self.envs.reset_done()  # (L, 4, 84, 84)
             s2, r, terminated, truncated, drones = self.envs.step(actions)
-            r = self.shaped(r, drones)  # (L,)
+            r = shaped_reward(r, drones, self.c)  # (L,)
             self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
         if self.forests.bit_generator.state != saved["forests"]:
             raise InputError(f"{self.folder}: its actions lead to other episodes on this machine")
@@ -232,12 +229,6 @@ class Run:
         self.rng.bit_generator.state, self.log = saved["rng"], saved["log"]
         if saved["config"]["steps"] != self.c.steps:
             self.agent.mean.n_averaged.zero_()  # a longer training averages its own last share
-
-
-@cache
-def random_steps(world: World) -> float:
-    """How long random episodes are in the validation forests, in the mean."""
-    return float(measure(fly_random(VALIDATION, world))["steps"].mean())
 
 
 # -------------------------------------------------- eval
@@ -255,34 +246,32 @@ def fly_random(seeds: Sequence[int], world: World) -> list[Episode]:
     return [e for _ in range(repeats) for e in fly(pilot, seeds, world, blind=True)]
 
 
-def evaluate(args: argparse.Namespace, pilots: dict[str, Pilot]) -> int:
+def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
     """Fly a network beside other pilots, which see nothing, through the same forests: a table,
     JSON, and a film of the network's first episode that crossed (or of the first)."""
-    shipped = Path(__file__).parent / "weights" / ("dqn-beacon.pt" if args.beacon else "dqn.pt")
-    q, world, name = load_weights(args.weights or shipped)
-    film, seeds = args.out / "flight.gif", range(args.first_seed, args.first_seed + args.episodes)
+    q, world, name = load_weights(args.weights, config.network)
+    seeds, film = range(args.first_seed, args.first_seed + args.episodes), args.out / "flight.gif"
     if not seeds or seeds[0] < 0 or args.threads < 1:
         raise InputError("episodes and threads must be 1 or more, and first-seed 0 or more")
-    torch.set_num_threads(args.threads)
     for path in (film, args.json or film):  # better to fail now than after all episodes
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir() or not os.access(path.parent, os.W_OK):
             raise InputError(f"{path} cannot be written")
+    torch.set_num_threads(args.threads)
     print(f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n", flush=True)
     flown = {"random": fly_random(seeds, world)}
-    others = {"straight": env.straight_pilot, **pilots, name: dqn_pilot(q)}
-    flown |= {who: fly(pilot, seeds, world, blind=who != name) for who, pilot in others.items()}
+    for who, pilot in (config.baselines | {name: dqn_pilot(q)}).items():
+        flown[who] = fly(pilot, seeds, world, blind=who != name)
     draws = np.random.default_rng(0).integers(len(seeds), size=(2000, len(seeds)))
     metrics = {who: summarize(flown[who], flown["random"], draws) for who in flown}
     print_table(metrics)
     if args.json:
-        report = {"weights": str(args.weights or shipped.name), "beacon": world.beacon}
-        report |= {"camera": world.camera, "forests": len(seeds), "first_seed": seeds[0]}
+        report = {"weights": args.weights.name, "beacon": world.beacon, "camera": world.camera}
+        report |= {"forests": len(seeds), "first_seed": seeds[0]}
         report["pilots"] = {who: metrics[who] | {"episodes": flown[who]} for who in flown}
         atomic_write(args.json, json.dumps(report).encode())
-    shown, buffer = flown[name][measure(flown[name])["crossed"].argmax()], io.BytesIO()
-    render.save_film(buffer, draw_film(shown, world, q, name), round(1000 * world.dt))
-    atomic_write(film, buffer.getvalue())
+    shown = flown[name][measure(flown[name])["crossed"].argmax()]
+    render.save_film(film, draw_film(shown, world, q, name), round(1000 * world.dt))
     print(f"\nwrote {film}: forest {shown['seed']}")
     return 0
 
@@ -353,15 +342,13 @@ def print_table(metrics: dict[str, dict]) -> None:
 @torch.no_grad()
 def draw_film(episode: Episode, world: World, q: QNetwork, name: str) -> Iterator[Any]:
     """The pictures of an episode: frame, path, and what the network says of each action."""
-    trunks, path = env.plant(episode["seed"], world), []
+    path = []
     for t, (s, drone) in enumerate(env.refly(episode, world)):
         path.append(drone.pose[:2])
-        action = int(episode["actions"][t]) if t < episode["steps"] else -1  # -1: none is chosen
         values = q(torch.from_numpy(s)[None])[0].numpy()  # (A,)
         text = f"{name}: {t * world.dt:.1f} s, {drone.d_goal:.1f} m to the goal\n"
-        text += f"reward so far {drone.total:.1f}   {drone.outcome}\n"
-        text += f"bars: {'score' if name == 'imitation' else 'Q'} of each turn, left to right"
-        yield render.draw_panel(s[-1], trunks, np.array(path), drone.outcome, values, action, text)
+        text += f"reward so far {drone.total:.1f}   {drone.outcome}"
+        yield render.draw_panel(s[-1], drone.trunks, np.array(path), drone.outcome, values, text)
 
 
 # -------------------------------------------------- files, signals: skip on a first reading
@@ -388,9 +375,9 @@ def load(path: Path | str, *keys: str) -> dict[str, Any]:
     """Read what save wrote, without running any code from the file. InputError if it cannot be
     read, is damaged, or does not hold these keys."""
     try:
-        with zipfile.ZipFile(path) as archive:  # checksums, and flags that torch leaves at 0
-            if archive.testzip() or any(part.external_attr for part in archive.infolist()):
-                raise zipfile.BadZipFile
+        archive = zipfile.ZipFile(path)  # holds checksums, and flags that torch leaves at 0
+        if archive.testzip() or any(part.external_attr for part in archive.infolist()):
+            raise zipfile.BadZipFile
         content = torch.load(path, weights_only=True)
         return {key: content[key] for key in keys}
     except Exception as error:  # a foreign file can fail in any way
@@ -404,10 +391,13 @@ def save_weights(path: Path, q: QNetwork, c: Config) -> None:
     save(path, {"pilot": c.pilot, "beacon": c.beacon, "camera": c.camera, "network": network})
 
 
-def load_weights(path: Path | str) -> tuple[QNetwork, World, str]:
+def load_weights(path: Path | str, network: type = QNetwork) -> tuple[QNetwork, World, str]:
     """Read a weights file: the network, its world, and the name of its pilot."""
-    saved, q = load(path, "pilot", "beacon", "camera", "network"), QNetwork(World.actions)
-    q.load_state_dict(saved["network"])
+    saved, q = load(path, "pilot", "beacon", "camera", "network"), network(World.num_actions)
+    try:
+        q.load_state_dict(saved["network"])
+    except RuntimeError as error:
+        raise InputError(f"{path} holds weights of another network: {saved['pilot']}") from error
     if not all(tensor.isfinite().all() for tensor in q.parameters()):
         raise InputError(f"{path} holds weights that are no finite numbers")
     return q, World(beacon=saved["beacon"], camera=saved["camera"]), saved["pilot"]
@@ -420,50 +410,39 @@ def kind(c: Config | type[Config]) -> list:
 
 @contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """A list that Ctrl-C, SIGTERM and SIGHUP are written to, so that the running step can end. The
-    same signal again acts at once. One that nohup ignores stays ignored."""
+    """A list that Ctrl-C, SIGTERM and SIGHUP are written to, so that the running step can end. One
+    that nohup ignores stays ignored."""
     stopped: list[int] = []
-
-    def stop(number: int, _frame: object) -> None:
-        stopped.append(number)
-        signal.signal(number, handlers[number])
-
-    numbers = [getattr(signal, x) for x in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, x)]
-    taken = [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
-    handlers = {number: signal.signal(number, stop) for number in taken}
-    try:
+    with ExitStack() as afterwards:
+        for number in {getattr(signal, x, signal.SIGINT) for x in ("SIGINT", "SIGTERM", "SIGHUP")}:
+            if signal.getsignal(number) != signal.SIG_IGN:
+                old = signal.signal(number, lambda number, _: stopped.append(number))
+                afterwards.callback(signal.signal, number, old)
         yield stopped
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
 
 
 # -------------------------------------------------- the command line: skip on a first reading
 
 
-class Parser(argparse.ArgumentParser):
-    """argparse, but a bad command line gets one line instead of the whole usage."""
-
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong."""
-        raise InputError(message)
-
-
 def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespace:
     """Read the command line; every setting is a flag of `train`."""
-    parser = Parser(prog="deepflight.py", description="Train a pilot, fly it beside others.")
-    commands = parser.add_subparsers(dest="command", metavar="train or eval", required=True)
-    sub = commands.add_parser("train", help="train a pilot", argument_default=argparse.SUPPRESS)
+    # Without a usage, what is wrong is said in one line.
+    silent = {"prog": "deepflight.py", "usage": argparse.SUPPRESS}
+    parser = argparse.ArgumentParser(**silent)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="train or eval")
+    sub = commands.add_parser("train", help="train a pilot", **silent)
     sub.add_argument("--name", default="", help="of the folder in runs/; default: a number")
-    sub.add_argument("--resume", type=Path, default=None, help="folder of a training to go on with")
+    sub.add_argument("--resume", type=Path, help="folder of a training to go on with")
     for f in fields(config):
         more = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type}
         more |= {"choices": f.metadata["legal"] or None} if f.type is str else {}
         text = f"{f.metadata['help']} (default: {f.default})"
         sub.add_argument("--" + f.name.replace("_", "-"), help=text, **more)
-    sub = commands.add_parser("eval", help="fly trained weights beside other pilots")
-    sub.add_argument("--weights", type=Path, help="default: the shipped ones")
-    sub.add_argument("--beacon", action="store_true", help="the shipped ones that see a beacon")
+    sub = commands.add_parser("eval", help="fly trained weights beside other pilots", **silent)
+    there = Path(__file__).parent / "weights"
+    sub.add_argument("--weights", type=Path, default=there / "dqn.pt", help="default: %(default)s")
+    beacon = {"action": "store_const", "const": there / "dqn-beacon.pt", "dest": "weights"}
+    sub.add_argument("--beacon", help="the shipped ones that see a beacon", **beacon)
     sub.add_argument("--episodes", type=int, default=100, help="default: %(default)s")
     sub.add_argument("--first-seed", type=int, default=TEST_FIRST, help="default: %(default)s")
     sub.add_argument("--json", type=Path, help="write every metric and episode to this file")
@@ -472,16 +451,17 @@ def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespac
     return parser.parse_args(argv)
 
 
-def start(args: argparse.Namespace, config: type[Config], train: Callable) -> Run:
+def start(args: argparse.Namespace, config: type[Config]) -> Run:
     """Begin a training, or go on with one."""
-    given = {f.name: getattr(args, f.name) for f in fields(config) if hasattr(args, f.name)}
+    given = {f.name: getattr(args, f.name) for f in fields(config)}
+    given = {name: value for name, value in given.items() if value is not None}
     if not args.resume:
-        c = config(**(config.beacon_recipe if given.get("beacon") else {}) | given)
         free = (f"{i:03d}" for i in count(1) if not Path(f"runs/{i:03d}").exists())
         folder = Path("runs", args.name or next(free))
-        run = Run(train, c, folder)
-        folder.mkdir(parents=True)  # FileExistsError if it is there
-        return run
+        if folder.exists():
+            raise InputError(f"{folder} exists: give another --name, or go on with --resume")
+        recipe = config.beacon_recipe if given.get("beacon") else {}
+        return Run(config(**recipe | given), folder)
     if args.name or given.keys() - {"steps"}:
         raise InputError(f"{args.resume} keeps its settings: only --steps may be given")
     keys = "config", "kind", "actions", "forests", "agent", "optimizer", "rng", "log"
@@ -491,33 +471,23 @@ def start(args: argparse.Namespace, config: type[Config], train: Callable) -> Ru
     c = config(**saved["config"] | given)
     if (flown := len(saved["actions"]) * c.num_envs) >= c.steps:
         raise InputError(f"{args.resume} has flown {flown:,} steps: give more by --steps")
-    return Run(train, c, args.resume, saved)
+    return Run(c, args.resume, saved)
 
 
-def main(
-    argv: Sequence[str] | None = None, config: type[Config] = Config, train: Callable = dqn.train,
-    pilots: dict[str, Pilot] | None = None,
-) -> int:  # fmt: skip
+def main(argv: Sequence[str] | None = None, config: type[Config] = Config) -> int:
     """Run one command; returns the exit code: 0, 2 after trouble, 128 + n after signal n."""
+    args = parse(argv, config)
     try:
-        args = parse(argv, config)
         training = args.command == "train"
-        code = start(args, config, train).go() if training else evaluate(args, pilots or {})
+        code = start(args, config).go() if training else evaluate(args, config)
         print(end="", flush=True)
         return code
-    except KeyboardInterrupt:
-        why, code = "interrupted", 130
-    except BlockingIOError:
-        why, code = "another training is running in this folder", 2
     except (InputError, OSError, MemoryError, FloatingPointError) as error:
-        why, code = error, 2
-    print(f"deepflight.py: {why}", file=sys.stderr)
-    return code
+        print(f"deepflight.py: {error}", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":
-    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
     if hasattr(signal, "SIGPIPE"):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # after `| head` end in silence
     sys.exit(main())

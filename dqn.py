@@ -69,7 +69,6 @@ import torch
 from numpy import ndarray
 from numpy.random import Generator
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel
 
 # How a transition ended: not at all, by the time limit, or in the world itself (env.py tells more).
 LIVE, TRUNCATED, TERMINAL = range(3)
@@ -282,9 +281,9 @@ def mirror(b: Batch, actions: int, rng: Generator) -> Batch:
     Flight, reward and camera are symmetric, so the reflection is one more true transition. Only the
     forest's grid is not quite symmetric: it stands 0.5 m off centre.
     """
-    flip = rng.random(len(b.a)) < 0.5  # (B,)
-    for frames in (b.s.numpy(), b.s2.numpy()):  # the same memory, seen as an array
-        frames[flip] = frames[flip, ..., ::-1]
+    flip = torch.from_numpy(rng.random(len(b.a)) < 0.5)  # (B,)
+    for frames in (b.s, b.s2):
+        frames[flip] = frames[flip].flip(-1)
     b.a[flip] = actions - 1 - b.a[flip]
     return b
 
@@ -311,7 +310,7 @@ class Agent(nn.Module):
             torch.manual_seed(int(rng.integers(2**63)))
             self.q = QNetwork(actions).to(memory_format=torch.channels_last)  # line 2
         self.q_target = copy.deepcopy(self.q)  # line 3
-        self.mean = AveragedModel(self.q)  # [+swa_fraction]
+        self.mean = torch.optim.swa_utils.AveragedModel(self.q)  # [+swa_fraction]
         eps = 1.5e-4 * c.huber_delta
         self.optimizer = torch.optim.Adam(self.q.parameters(), c.lr, eps=eps, fused=True)
         self.epsilon, self.loss = 1.0, 0.0
@@ -417,7 +416,7 @@ def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator
         random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
         a = np.where(explore, random, greedy(agent.q, s))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
-        replay.add(s, a, shaped(r, drones), s2, terminated, truncated)  # 11
+        replay.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11
         for _ in range(due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0):
             batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
             batch = mirror(batch, envs.num_actions, rng) if c.mirror else batch  # [+mirror]

@@ -62,7 +62,7 @@ import numpy as np
 import pymunk
 from numpy import ndarray
 
-from render import PIXELS, Scene, camera
+from render import PIXELS, Scene, draw_frames
 
 STACK = 4  # frames in an observation [DF §II-A]
 OUTCOMES = ("crash", "goal", "far", "back", "side", "time")  # how an episode may end
@@ -83,7 +83,7 @@ class World(Scene):
     speed: float = 5.0  # m/s, authors' simulator
     dt: float = 0.1  # s, one control step: ours
     yaw_rate: float = 0.7  # rad/s, the sharpest turn [DF §II-A]
-    actions: int = 9  # yaw rates from -0.7 (right) to +0.7 (left) [DF §II-A]
+    num_actions: int = 9  # yaw rates from -0.7 (right) to +0.7 (left) [DF §II-A]
     laser_range: float = 20.0  # m, authors' simulator
     d_neg: float = 2.0  # m, this and the next four: [DF §II-A]
     d_crash: float = 0.75  # m
@@ -157,10 +157,10 @@ class Drone:
         ValueError if the episode has ended, or if there is no such action.
         """
         world = self.world
-        if self.outcome or not 0 <= action < world.actions:
+        if self.outcome or not 0 <= action < world.num_actions:
             raise ValueError(f"no action {action}, or the episode has ended ({self.outcome})")
         self.actions.append(int(action))
-        yaw_rate = world.yaw_rate * (2 * action / (world.actions - 1) - 1)  # rad/s
+        yaw_rate = world.yaw_rate * (2 * action / (world.num_actions - 1) - 1)  # rad/s
         heading = self.body.angle + yaw_rate * world.dt  # rad: turn first, then fly
         self.body.velocity = world.speed * math.cos(heading), world.speed * math.sin(heading)
         self.body.angular_velocity = yaw_rate
@@ -207,10 +207,10 @@ class VecForest:
     """
 
     def __init__(self, world: World, num_envs: int, seeds: Iterable, blind: bool = False) -> None:
-        self.world, self.num_actions, self.blind = world, world.actions, blind
+        self.world, self.num_actions, self.blind = world, world.num_actions, blind
         self.drones, self.seeds = [Drone(world) for _ in range(num_envs)], iter(seeds)
         self.episodes: list[Episode] = []  # all that have ended
-        self.actions: list[bytes] = []  # of every pass, one byte for each active drone
+        self.history: list[bytes] = []  # the actions of every pass, one byte an active drone
         self.steps = 0  # control steps of all drones together
 
     @property
@@ -238,7 +238,7 @@ class VecForest:
         for drone, frame in zip(drones, self.look(drones), strict=True):
             drone.observation = np.concatenate([drone.observation[1:], frame[None]])
         s2 = np.array([drone.observation for drone in drones])  # (E, 4, 84, 84)
-        self.actions.append(bytes(drone.actions[-1] for drone in drones))
+        self.history.append(bytes(drone.actions[-1] for drone in drones))
         self.steps += len(drones)
         self.episodes += [drone.episode() for drone in drones if drone.outcome]
         outcomes = np.array([drone.outcome for drone in drones])  # (E,)
@@ -250,7 +250,7 @@ class VecForest:
             return np.zeros((len(drones), PIXELS, PIXELS), np.uint8)
         poses = np.array([drone.pose for drone in drones])  # (E, 3)
         goal = (self.world.length, 0) if self.world.beacon else None
-        return camera(poses, [drone.trunks for drone in drones], self.world, goal)
+        return draw_frames(poses, [drone.trunks for drone in drones], self.world, goal)
 
 
 # -------------------------------------------------- pilots without a network

@@ -57,7 +57,7 @@ Not in this file: textures, shadows, leaning trunks, a drone that climbs.
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import BinaryIO
+from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
@@ -169,7 +169,7 @@ def layer(
     return (top <= ROWS) & (foot > ROWS), value[:, None]
 
 
-def camera(
+def draw_frames(
     poses: ndarray, trunks: Sequence[ndarray], scene: Scene, beacon: Sequence[float] | None = None
 ) -> ndarray:
     """Draw what E drones see: frames (E, 84, 84) uint8.
@@ -217,10 +217,10 @@ PANEL = (624, 328)  # px, of a picture; it is drawn twice as large, so that line
 
 
 def draw_panel(
-    frame: ndarray, trunks: ndarray, path: ndarray, outcome: str, q: ndarray, action: int, text: str
+    frame: ndarray, trunks: ndarray, path: ndarray, outcome: str, q: ndarray, text: str
 ) -> Image.Image:
     """One picture: the frame (84, 84), the path (T, 2) on a map of the trunks (N, 2), both in m,
-    and what the network says of each action, q (A,), left turns on the left, the chosen one red."""
+    and what the network says of each action, q (A,), left turns on the left, the greatest red."""
     image = Image.new("RGB", (2 * PANEL[0], 2 * PANEL[1]), "#f4f4ee")
     draw = ImageDraw.Draw(image)
     image.paste(Image.fromarray(frame).resize((464, 464), Image.Resampling.NEAREST))
@@ -232,12 +232,13 @@ def draw_panel(
     draw.circle(tuple(path[-1]), 8, fill=colour)
     for a, value in enumerate(q):
         x, height = 8 + 50 * (len(q) - 1 - a), 120 * (value - q.min()) / max(np.ptp(q), 1e-9)
-        draw.rectangle([x, 608 - height, x + 42, 612], fill="crimson" if a == action else "gray")
+        colour = "crimson" if value == q.max() else "gray"
+        draw.rectangle([x, 608 - height, x + 42, 612], fill=colour)
     draw.text((496, 476), text, fill="black", font_size=34, spacing=8)
     return image.resize(PANEL, Image.Resampling.BOX)
 
 
-def save_film(file: BinaryIO, pictures: Iterable[Image.Image], milliseconds: int) -> None:
+def save_film(path: Path, pictures: Iterable[Image.Image], milliseconds: int) -> None:
     """Write an endless GIF."""
     first, *rest = (picture.quantize(64, Image.Quantize.FASTOCTREE) for picture in pictures)
-    first.save(file, "GIF", save_all=True, append_images=rest, duration=milliseconds, loop=0)
+    first.save(path, save_all=True, append_images=rest, duration=milliseconds, loop=0)

@@ -235,7 +235,7 @@ WALK = DQNConfig(
 def test_dqn_solves_a_tiny_mdp() -> None:
     torch.set_num_threads(1)
     envs = Corridor()
-    *_, (one, _) = dqn.train(WALK, envs, np.random.default_rng(0), lambda r, _: r)
+    *_, (one, _) = dqn.train(WALK, envs, np.random.default_rng(0), lambda r, *_: r)
     assert dqn.greedy(one.q, envs.frames[1:5]).tolist() == [1, 1, 1, 1]
     best = one.q(torch.from_numpy(envs.frames[1:5])).max(1).values.tolist()
     assert best == approx([0.9**3, 0.9**2, 0.9, 1.0], abs=0.1)
@@ -244,7 +244,7 @@ def test_dqn_solves_a_tiny_mdp() -> None:
 def test_the_loop_acts_greedily_syncs_the_target_network_and_averages_the_last_share() -> None:
     c = replace(WALK, steps=160, learning_starts=80, batch_size=4, target_every=36, lr_decay=0.5)
     c, envs = replace(c, epsilon_final=0.0, epsilon_decay=1, swa_fraction=0.25), Corridor()
-    loop = dqn.train(c, envs, np.random.default_rng(0), lambda r, _: r)
+    loop = dqn.train(c, envs, np.random.default_rng(0), lambda r, *_: r)
     one, replay = next(loop)
     synced = one.q.head[2].weight.detach().clone()
     choice, last = dqn.greedy(one.q, envs.frames[1:5]), []

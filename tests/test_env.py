@@ -144,7 +144,7 @@ def test_where_no_seed_is_left_a_drone_stays_inactive() -> None:
         envs.step([4] * len(s))
     assert passes == sorted(passes, reverse=True) and {*passes} == {1, 2, 3}
     assert sorted(episode["seed"] for episode in envs.episodes) == [5, 6, 7, 8]
-    assert envs.active == [] and [len(actions) for actions in envs.actions] == passes
+    assert envs.active == [] and [len(actions) for actions in envs.history] == passes
     assert envs.steps == sum(passes) == sum(episode["steps"] for episode in envs.episodes)
 
 

@@ -10,7 +10,17 @@ from numpy import ndarray
 from PIL import Image
 from pytest import approx
 
-from render import BEARINGS, PANEL, Scene, background, camera, draw_panel, layer, raycast, save_film
+from render import (
+    BEARINGS,
+    PANEL,
+    Scene,
+    background,
+    draw_frames,
+    draw_panel,
+    layer,
+    raycast,
+    save_film,
+)
 
 SCENE, STEREO = Scene(), Scene(camera="disparity")
 RED, GREY = (220, 20, 60), (128, 128, 128)
@@ -21,7 +31,7 @@ def see(
     *trunks: tuple, scene: Scene = SCENE, beacon: tuple | None = None, pose: tuple = (0, 0, 0)
 ) -> ndarray:
     """What one camera sees (84, 84)."""
-    return camera(np.array([pose]), [np.array(trunks).reshape(-1, 2)], scene, beacon)[0]
+    return draw_frames(np.array([pose]), [np.array(trunks).reshape(-1, 2)], scene, beacon)[0]
 
 
 def painted(frame: ndarray) -> ndarray:
@@ -137,19 +147,19 @@ def test_drawn_side_by_side_is_drawn_alone(beacon: tuple) -> None:
         forests = [random_trunks(rng, trunks) for trunks in rng.integers(200, size=n)]
         poses = np.column_stack([rng.uniform(-0.7, 0.7, (n, 2)), rng.normal(0, 2, n)])
         poses[-1], forests[-1] = 0.0, np.array([[-5.0, 0.0]])  # the last one sees no trunk
-        frames = camera(poses, forests, SCENE, beacon)
+        frames = draw_frames(poses, forests, SCENE, beacon)
         assert (frames.shape, frames.dtype) == ((n, 84, 84), np.uint8)
         for frame, pose, forest in zip(frames, poses, forests, strict=True):
             assert (frame == see(*forest, beacon=beacon, pose=pose)).all()
         assert painted(frames[-1]).any() == (beacon is not None)
-    assert not painted(camera(np.zeros((3, 3)), [NONE] * 3, SCENE)).any()
+    assert not painted(draw_frames(np.zeros((3, 3)), [NONE] * 3, SCENE)).any()
 
 
 def test_a_film_shows_frame_trunks_path_and_values_at_its_pace(tmp_path: Path) -> None:
     frame = see((6.0, 1.0))
     panel = draw_panel(
         *(frame, np.array([[45.0, 10.0]]), np.array([[0.0, 0.0], [9.0, 0.0]]), "crash"),
-        *(np.array([5.0, 7.0, 6.0]), 1, "text"),
+        *(np.array([5.0, 7.0, 6.0]), "text"),
     )
     nearest = ((np.arange(232) + 0.5) * 84 / 232).astype(int)
     shown = np.asarray(panel)[:232, :232, 0].astype(int)  # some pixels mix two
@@ -163,7 +173,6 @@ def test_a_film_shows_frame_trunks_path_and_values_at_its_pace(tmp_path: Path) -
         for a, c in enumerate((GREY, RED, GREY))
     ]
     assert heights == approx([2, 62, 32], abs=2)  # the worst has the lowest bar, the chosen is red
-    with (tmp_path / "f.gif").open("wb") as file:
-        save_film(file, [panel, panel.rotate(1), panel], 100)
+    save_film(tmp_path / "f.gif", [panel, panel.rotate(1), panel], 100)
     with Image.open(tmp_path / "f.gif") as film:
         assert (film.n_frames, film.info["duration"], film.info["loop"]) == (3, 100, 0)

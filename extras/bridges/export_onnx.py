@@ -81,7 +81,7 @@ def observations(q: QNetwork, world: World, size: int) -> ndarray:
     while len(seen) < size:
         s = envs.reset_done()  # (8, 4, 84, 84)
         seen += [*s]
-        envs.step(np.where(np.arange(8) % 2, rng.integers(world.actions, size=8), greedy(q, s)))
+        envs.step(np.where(np.arange(8) % 2, rng.integers(world.num_actions, size=8), greedy(q, s)))
     return np.stack(seen[:size])
 
 

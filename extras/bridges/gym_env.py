@@ -61,7 +61,7 @@ def dress(env: AnyEnv, world: World, num_envs: int, render_mode: str | None, for
     env.render_mode, env.numbers = render_mode, RANGES[forests]
     env.metadata = env.metadata | {"render_fps": max(1, round(1 / world.dt))}
     env.observation_space = Box(0, 255, (STACK, PIXELS, PIXELS), np.uint8)
-    env.action_space = Discrete(world.actions)
+    env.action_space = Discrete(world.num_actions)
 
 
 def begin(env: AnyEnv, drone: Drone, seed: int | None) -> None:

@@ -25,6 +25,7 @@ on one, `ray start --address HOST:6379` on the others), with this Python and the
 and run the script on one of them; the code travels from here.
 """
 
+import argparse
 import logging
 import subprocess
 import sys
@@ -46,7 +47,7 @@ from ray.rllib.utils.schedules.scheduler import Scheduler
 from ray.tune.registry import register_env
 from torch import Tensor, nn
 
-from deepflight import Config, Parser, save_weights
+from deepflight import Config, save_weights
 from dqn import InputError, QNetwork
 from extras.bridges.gym_env import ID, Forest
 
@@ -183,14 +184,14 @@ def start(address: str | None, runners: int) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Join or start a Ray, and train. Trouble comes with one line and exit code 2."""
-    parser = Parser(prog="rllib_train", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="rllib_train", usage=argparse.SUPPRESS)
     parser.add_argument("--runners", type=int, default=2, help="processes that fly, one a CPU")
     parser.add_argument("--steps", type=int, default=Config.steps, help="control steps in all")
     parser.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
     parser.add_argument("--address", help="of a running Ray; else one is started here")
     parser.add_argument("--out", type=Path, default="runs/rllib.pt", help="the weights' file")
+    args = parser.parse_args(argv)
     try:
-        args = parser.parse_args(argv)
         c = RLlibConfig(steps=args.steps, beacon=args.beacon)
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.open("ab").close()  # better to fail now than after the training

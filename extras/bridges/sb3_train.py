@@ -15,6 +15,7 @@ validation forests without random actions, and prints the same of them as `eval/
 it writes are the last ones. Ctrl-C writes those so far.
 """
 
+import argparse
 import math
 import sys
 from collections.abc import Sequence
@@ -27,7 +28,7 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from deepflight import Config, Parser, save_weights
+from deepflight import Config, save_weights
 from dqn import InputError, QNetwork, linear_schedule
 from extras.bridges.gym_env import Forest
 
@@ -111,12 +112,12 @@ def train(c: Config, out: Path) -> int:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Check what is given, then train. Trouble comes with one line and exit code 2."""
-    parser = Parser(prog="sb3_train", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="sb3_train", usage=argparse.SUPPRESS)
     parser.add_argument("--steps", type=int, default=Config.steps, help="control steps in all")
     parser.add_argument("--beacon", action="store_true", help="put a visible pole at the goal")
     parser.add_argument("--out", type=Path, default="runs/sb3.pt", help="the weights' file")
+    args = parser.parse_args(argv)
     try:
-        args = parser.parse_args(argv)
         c = SB3Config(steps=args.steps, beacon=args.beacon)
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.open("ab").close()  # better to fail now than after the training

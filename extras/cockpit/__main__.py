@@ -13,6 +13,7 @@ path: weights are looked up by name in a list.
 Not here: encryption, users, other machines. Do not put this server on a network.
 """
 
+import argparse
 import json
 import sys
 import threading
@@ -100,10 +101,9 @@ class Handler(BaseHTTPRequestHandler):
 def main(argv: list[str] | None = None) -> int:
     """Serve until Ctrl-C. Returns the exit code: 130, as a shell expects then; 2 for bad input."""
     try:  # the imports too, because torch takes seconds
-        from deepflight import Parser
         from extras.cockpit.episodes import Hangar
 
-        parser = Parser(prog="extras.cockpit", description="Fly a drone, and ask the network why.")
+        parser = argparse.ArgumentParser(prog="extras.cockpit", usage=argparse.SUPPRESS)
         parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"default: {PORT}")
         port = parser.parse_args(argv).port
         try:

@@ -28,7 +28,7 @@ from deepflight import TRAIN_END, Config, load_weights
 from dqn import InputError, QNetwork
 from env import STACK, Pilot, VecForest, World, random_pilot, straight_pilot
 from extras.lessons.expert import laser_pilot
-from render import BEARINGS, camera, seen_from
+from render import BEARINGS, draw_frames, seen_from
 
 ROOT = Path(__file__).parents[2]
 WORLDS = {"plain": World(), "beacon": World(beacon=True), "disparity": World(camera="disparity")}
@@ -68,7 +68,7 @@ PILOTS |= {"straight": straight_pilot}
 # What may be asked, as patterns.
 LEGAL = dict.fromkeys(("more", "since", "time"), "[0-9]{1,4}")
 LEGAL |= {"world": "|".join(WORLDS), "pilot": "|".join(PILOTS), "seed": "[0-9]{1,18}"}
-LEGAL |= {"weights": ".{1,300}", "actions": f"[0-{World.actions - 1}]{{0,{World.max_steps}}}"}
+LEGAL |= {"weights": ".{1,300}", "actions": f"[0-{World.num_actions - 1}]{{0,{World.max_steps}}}"}
 
 
 def check(ask: Any, keys: str) -> None:
@@ -188,5 +188,5 @@ def without(poses: ndarray, recording: Recording) -> tuple[list[int], ndarray]:
     # (4 + 4 K, 3), and as many forests: one for each camera
     cameras, seen = np.tile(poses, (len(forests), 1)), [f for f in forests for _ in poses]
     # In a world without a pole the last observation equals the first, and so is left out.
-    frames = [camera(cameras, seen, world, goal), camera(poses, [trunks] * STACK, world)]
+    frames = [draw_frames(cameras, seen, world, goal), draw_frames(poses, [trunks] * STACK, world)]
     return [-2, *near, -1], np.concatenate(frames).reshape(-1, *recording.drone.observation.shape)

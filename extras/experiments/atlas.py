@@ -105,7 +105,7 @@ def cause(episode: Episode, world: World) -> str:
     if not any(seen(at(episode, world, steps), trunk) for steps in last):
         return "unseen"
     before = max(episode["steps"] - 10, 0)
-    ways = (doomed(at(episode, world, before), action) for action in range(world.actions))
+    ways = (doomed(at(episode, world, before), action) for action in range(world.num_actions))
     return "trapped" if all(ways) else "careless"
 
 

@@ -9,7 +9,6 @@ count. Writes results/clock.json. A question that has its answer there is not as
 
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -30,22 +29,21 @@ class Question(NamedTuple):
     """When does a training pass a bar?"""
 
     config: type[Config]
-    train: Callable
     metric: str
     bar: float
     seeds: int  # seeds 0, 1, ...
 
 
 QUESTIONS = {
-    "from rewards": Question(Config, dqn.train, "longer", 1.8, 5),
-    "imitation": Question(expert.ExpertConfig, expert.train, "crossed", 0.5, 3),
+    "from rewards": Question(Config, "longer", 1.8, 5),
+    "imitation": Question(expert.ExpertConfig, "crossed", 0.5, 3),
 }
 
 
 def answer(asked: Question, seed: int) -> dict[str, float]:
     """The step and the seconds of the first weights that pass; ValueError if none do."""
     baseline, draws = fly_random(FORESTS, World()), np.arange(len(FORESTS))[None]
-    run = Run(asked.train, asked.config(seed=seed), Path())  # it writes nothing there
+    run = Run(asked.config(seed=seed), Path())  # it writes nothing there
     seconds, start = 0.0, time.perf_counter()
     for _ in run.loop:
         if dqn.due(EVERY, step := run.envs.steps, run.c.num_envs):

@@ -27,7 +27,7 @@ from deepflight import TRAIN_END, Config, measure
 from dqn import QNetwork, linear_schedule
 from env import STACK, VecForest, World, fly, plant
 from extras.lessons.expert import plan, scan
-from render import camera
+from render import draw_frames
 
 ROOT = Path(__file__).parents[2]
 WORLD = World()
@@ -47,7 +47,7 @@ def somewhere(seed: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarr
         gaps = np.hypot(*(trunks[:, None] - way).T)  # (4, N) m
         if gaps.min() > WORLD.trunk_radius + WORLD.d_crash:
             poses = np.column_stack([way, np.full(STACK, heading)])  # (4, 3)
-            return camera(poses, [trunks] * STACK, WORLD), np.array([*at, heading])
+            return draw_frames(poses, [trunks] * STACK, WORLD), np.array([*at, heading])
 
 
 def answer(heading: np.ndarray) -> np.ndarray:

@@ -17,7 +17,6 @@ import csv
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import matplotlib
 
@@ -120,8 +119,8 @@ def count_all() -> None:
     torch.set_num_threads(1)
     c, world, episodes = DemoConfig(), World(), demonstrate(max(COUNTS))
     for count in COUNTS:
-        demo_replay = load_demos(episodes[:count], c, world, partial(shaped_reward, c=c))
-        agent = Agent(c, World.actions, np.random.default_rng(0))
+        demo_replay = load_demos(episodes[:count], c, world, shaped_reward)
+        agent = Agent(c, World.num_actions, np.random.default_rng(0))
         pretrain(agent, demo_replay, c, np.random.default_rng(0))
         note(f"{count} demonstrations", 0, fly(dqn_pilot(agent.q), FORESTS, world))
 

@@ -110,8 +110,8 @@ def main() -> None:
     q, world, name = load_weights(ROOT / "weights/dqn.pt")
     episodes = report["pilots"][name]["episodes"]
     shown = episodes[measure(episodes)["crossed"].argmax()]
-    with (ROOT / "figures/flight.gif").open("wb") as file:
-        save_film(file, draw_film(shown, world, q, name), round(1000 * world.dt))
+    film = ROOT / "figures/flight.gif"
+    save_film(film, draw_film(shown, world, q, name), round(1000 * world.dt))
     print("wrote figures/flight.gif")
 
 

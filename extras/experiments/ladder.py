@@ -148,7 +148,7 @@ def finished(folder: Path) -> bool:
 
 def networks(folder: Path) -> dict[str, QNetwork]:
     """What best.pt keeps, and the newest network, which also goes to last.pt."""
-    agent, q = load(folder / "checkpoint.pt", "agent")["agent"], QNetwork(World.actions)
+    agent, q = load(folder / "checkpoint.pt", "agent")["agent"], QNetwork(World.num_actions)
     q.load_state_dict({key: agent["q." + key] for key in q.state_dict()})
     save_weights(folder / "last.pt", q, Config())
     return {name: load_weights(folder / f"{name}.pt")[0] for name in ("best", "last")}

@@ -45,7 +45,7 @@ import env
 from deepflight import dqn_pilot, fly_random, interval, load, load_weights, measure, summarize
 from env import Episode, World, fly, plant
 from extras.lessons import expert
-from render import CAMERAS, PIXELS, SLOPES, Scene, background, camera, shade
+from render import CAMERAS, PIXELS, SLOPES, Scene, background, draw_frames, shade
 
 ROOT = Path(__file__).parents[2]
 RESULT, FIGURE = ROOT / "results/transfer.json", ROOT / "figures/transfer.png"
@@ -102,7 +102,7 @@ CHANGES = {  # metric -> its name in `measure`; is it counted in mean episodes o
     "crossed": ("crossed", False), "crash": ("crash", False), "longer": ("steps", True),
 }  # fmt: skip
 Trunks = Sequence[ndarray]
-Seeing = Callable[..., ndarray]  # like render.camera
+Seeing = Callable[..., ndarray]  # like render.draw_frames
 COLUMNS, TILE = 5, (174, 212)  # of the drawing; px
 POSE = np.array([[43.0, -12.85, 0.19]])  # where it is taken: x, y in m, heading in rad
 
@@ -111,11 +111,11 @@ POSE = np.array([[43.0, -12.85, 0.19]])  # where it is taken: x, y in m, heading
 
 
 def wear(look: Look, poses: ndarray, trunks: Trunks, scene: Scene, *beacon: Any) -> ndarray:
-    """What render.camera draws, in this look: (E, 84, 84) uint8."""
+    """What render.draw_frames draws, in this look: (E, 84, 84) uint8."""
     scene = replace(scene, **look.scene) if look.scene else scene
-    frames = camera(poses, trunks, scene, *beacon)  # (E, 84, 84)
+    frames = draw_frames(poses, trunks, scene, *beacon)  # (E, 84, 84)
     if look.stripes and scene.camera == "grey":
-        frames = ringed(frames, look, scene, camera(poses, trunks, stereo(scene), *beacon))
+        frames = ringed(frames, look, scene, draw_frames(poses, trunks, stereo(scene), *beacon))
     change = mismatch if scene.camera == "disparity" else expose
     rngs = [np.random.default_rng(np.abs([*pose, *wood[:1].ravel()]).view(np.uint32))
             for pose, wood in zip(poses, trunks, strict=True)]  # fmt: skip
@@ -201,11 +201,11 @@ def wear_at_random(poses: ndarray, trunks: Trunks, scene: Scene, *beacon: Any) -
 @contextmanager
 def seeing(see: Seeing) -> Iterator[None]:
     """Give every drone these eyes."""
-    plain, env.camera = env.camera, see
+    plain, env.draw_frames = env.draw_frames, see
     try:
         yield
     finally:
-        env.camera = plain
+        env.draw_frames = plain
 
 
 # -------------------------------------------------- train, fly
@@ -220,7 +220,7 @@ def train(kind: str) -> int:
     if (folder / "checkpoint.pt").exists():
         words = ["--resume", str(folder)]
     with seeing(wear_at_random):
-        return deepflight.main(["train", *words], expert.ExpertConfig, expert.train)
+        return deepflight.main(["train", *words], expert.ExpertConfig)
 
 
 def trained(weights: Path) -> bool:
@@ -317,7 +317,7 @@ def time_both() -> None:
         for i, world in enumerate(worlds):
             start = time.perf_counter()
             for eight in poses:
-                camera(eight, trunks, world)
+                draw_frames(eight, trunks, world)
             row[i] = time.perf_counter() - start
     ratio = np.median(taken[:, 1] / taken[:, 0])
     print(f"disparity / grey {ratio:.2f}; eight grey frames {taken[:, 0].min() * 20:.2f} ms")

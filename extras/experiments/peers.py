@@ -37,7 +37,7 @@ def forest(drones: int) -> Iterator[int]:
     envs = VecForest(World(), drones, count())
     while True:
         envs.reset_done()
-        envs.step(RNG.integers(World.actions, size=drones))
+        envs.step(RNG.integers(World.num_actions, size=drones))
         yield drones
 
 
@@ -87,7 +87,7 @@ def sb3() -> Iterator[int]:
 
 def ours(bfloat16: bool) -> Iterator[int]:
     """Our training, past its warm-up."""
-    run = Run(dqn.train, PLAIN, Path())  # it writes nothing there
+    run = Run(PLAIN, Path())  # it writes nothing there
     while True:
         dqn.BFLOAT16 = bfloat16  # each time, because two trainings take turns
         next(run.loop)

@@ -40,7 +40,7 @@ def clutter(frame: np.ndarray) -> tuple[float, float]:
 
 def look(episode: Episode) -> np.ndarray:
     """Fly again: left and right clutter, y in m, yaw rate in rad/s at every action (T, 4)."""
-    rates = WORLD.yaw_rate * np.linspace(-1, 1, WORLD.actions)  # (A,) rad/s
+    rates = WORLD.yaw_rate * np.linspace(-1, 1, WORLD.num_actions)  # (A,) rad/s
     flown = zip(refly(episode, WORLD), episode["actions"], strict=False)  # without the last frame
     return np.array([(*clutter(s[-1]), drone.pose[1], rates[int(a)]) for (s, drone), a in flown])
 

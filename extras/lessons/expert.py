@@ -83,6 +83,7 @@ BEAMS = 360  # of the laser, all around: ours
 class DemoConfig(Config):
     """DQN with recorded episodes, and the switches of this file."""
 
+    command: ClassVar[str] = "python -m extras.lessons.expert demonstrations"
     pilot: ClassVar[str] = "demonstrations"
     # A network that has seen demonstrations need not begin by chance.
     epsilon_decay: int = setting(1, "control steps until epsilon_final", 1, 10**9)
@@ -98,16 +99,6 @@ class DemoConfig(Config):
         super().__post_init__()
         if not self.imitation and not self.bellman:
             raise InputError("there is nothing to learn from: give --imitation or --bellman")
-
-
-# The expert knows where the far edge is, so a smaller bonus for it and for metres is enough. 115
-# was found by trial: with 125 the pilot leaves sooner, and its return is smaller; with 80 and half
-# a point a metre its return is larger, but it crosses less often.
-ExpertConfig = recipe(
-    "ExpertConfig", DemoConfig, pilot="imitation", validate_every=20_000,
-    imitation=True, bellman=False, learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000,
-    lr_decay=0.0, forward_reward=1.0, far_bonus=115.0,
-)  # fmt: skip
 
 
 # -------------------------------------------------- the expert
@@ -150,7 +141,7 @@ def plan(bearings: ndarray, distances: ndarray, pose: tuple, world: World, c: Co
     later = bonus_ahead(at, headings, world, c)  # (W, T)
     bonus = np.select([crash, goal, far, out], [0, c.goal_bonus, c.far_bonus, 0], later)  # (W, T)
     r = r + np.where(k == last, c.gamma * bonus, 0)  # (W, T)
-    return (c.gamma**k * r * (k <= last)).sum(1).reshape(world.actions, -1).max(1)
+    return (c.gamma**k * r * (k <= last)).sum(1).reshape(world.num_actions, -1).max(1)
 
 
 def bonus_ahead(at: ndarray, headings: ndarray, world: World, c: Config) -> ndarray:
@@ -168,7 +159,7 @@ def bonus_ahead(at: ndarray, headings: ndarray, world: World, c: Config) -> ndar
 def trajectories(world: World) -> tuple[ndarray, ndarray]:
     """The candidates of a drone at 0 that faces along x: places (W, T) m and headings (W, T) rad.
     Number a * A + b begins with yaw rate a and goes on with b."""
-    rates = world.yaw_rate * np.linspace(-1, 1, world.actions)  # (A,) rad/s
+    rates = world.yaw_rate * np.linspace(-1, 1, world.num_actions)  # (A,) rad/s
     steps = [max(round(seconds / world.dt), 1) for seconds in (0.6, 1.6)]
     pairs = np.stack(np.meshgrid(rates, rates, indexing="ij"), -1).reshape(-1, 2)  # (W, 2)
     headings = np.cumsum(np.repeat(pairs, steps, 1), 1) * world.dt  # (W, T) rad
@@ -306,7 +297,7 @@ def load_demos(demos: list[Episode], c: DemoConfig, world: World, shaped: Callab
     for a in (np.array([int(digit)]) for episode in demos for digit in episode["actions"]):
         s = envs.reset_done()  # (1, 4, 84, 84)
         s2, r, terminated, truncated, drones = envs.step(a)
-        replay.add(s, a, shaped(r, drones), s2, terminated, truncated)
+        replay.add(s, a, shaped(r, drones, c), s2, terminated, truncated)
     if [e["outcome"] for e in envs.episodes] != [e["outcome"] for e in demos]:
         raise InputError("on this machine the demonstrations end elsewhere")
     return replay
@@ -339,7 +330,7 @@ def train(c: DemoConfig, envs: VecForest, rng: Generator, shaped: Callable) -> I
         exploratory = envs.scores.argmax(1) if c.imitation else random  # (L,) [!]
         a = np.where(explore, exploratory, greedy(agent.q, s))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
-        replay.add(s, a, shaped(r, drones), s2, terminated, truncated)  # 11
+        replay.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11
         updates = due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0
         for _ in range(updates):
             batch = sample(replay, demo_replay, c, rng)  # 12 [!]
@@ -351,12 +342,23 @@ def train(c: DemoConfig, envs: VecForest, rng: Generator, shaped: Callable) -> I
         yield agent, replay
 
 
+DemoConfig.train = staticmethod(train)
+DemoConfig.baselines = Config.baselines | {"laser": laser_pilot(DemoConfig.gamma)}
+# The expert knows where the far edge is, so a smaller bonus for it and for metres is enough. 115
+# was found by trial: with 125 the pilot leaves sooner, and its return is smaller; with 80 and half
+# a point a metre its return is larger, but it crosses less often.
+ExpertConfig = recipe(
+    "ExpertConfig", DemoConfig, pilot="imitation", validate_every=20_000,
+    imitation=True, bellman=False, learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000,
+    lr_decay=0.0, forward_reward=1.0, far_bonus=115.0, command="python -m extras.lessons.expert",
+)  # fmt: skip
+
+
 def main() -> int:
     """The command line of deepflight.py; the word `demonstrations` before `train` takes the recipe
     that does not imitate."""
-    recorded, pilots = sys.argv[1:2] == ["demonstrations"], {"laser": laser_pilot(DemoConfig.gamma)}
-    config = DemoConfig if recorded else ExpertConfig
-    return deepflight.main(sys.argv[1 + recorded :], config, train, pilots)
+    recorded = sys.argv[1:2] == ["demonstrations"]
+    return deepflight.main(sys.argv[1 + recorded :], DemoConfig if recorded else ExpertConfig)
 
 
 if __name__ == "__main__":

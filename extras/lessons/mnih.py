@@ -30,15 +30,17 @@ from env import VecForest
 from extras.lessons import recipe
 
 TextbookConfig = recipe(
-    "TextbookConfig", deepflight.Config, double=False, n_steps=1, mirror=False, huber_delta=1.0,
+    "TextbookConfig", deepflight.Config, command="python -m extras.lessons.mnih textbook",
+    double=False, n_steps=1, mirror=False, huber_delta=1.0,
     lr_decay=1.0, swa_fraction=0.0, forward_reward=0.0, goal_bonus=0.0, far_bonus=0.0,
 )  # fmt: skip
 
 # Mnih's table says that the target network is synced every 10,000 updates. His code does it every
 # 10,000 steps. We follow the code.
 MnihConfig = recipe(
-    "MnihConfig", TextbookConfig, pilot="mnih", steps=1_400_000, replay_size=1_000_000,
-    learning_starts=50_000, target_every=10_000, epsilon_final=0.1, epsilon_decay=1_000_000,
+    "MnihConfig", TextbookConfig, pilot="mnih", command="python -m extras.lessons.mnih",
+    steps=1_400_000, replay_size=1_000_000, learning_starts=50_000,
+    target_every=10_000, epsilon_final=0.1, epsilon_decay=1_000_000,
 )  # fmt: skip
 
 
@@ -74,12 +76,15 @@ def train(
     yield from loop
 
 
+MnihConfig.train = staticmethod(train)
+
+
 def main() -> int:
     """The command line of deepflight.py."""
     if sys.argv[1:2] == ["textbook"]:
         return deepflight.main(sys.argv[2:], TextbookConfig)
     dqn.BFLOAT16 = False  # here too, because a checkpoint that goes on must have the same
-    return deepflight.main(sys.argv[1:], MnihConfig, train)
+    return deepflight.main(sys.argv[1:], MnihConfig)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from env import Pilot, World, fly, refly, straight_pilot
 from extras.cockpit.__main__ import LARGEST, Server
 from extras.cockpit.episodes import ROOT, Hangar
 from extras.lessons.expert import laser_pilot
-from render import camera
+from render import draw_frames
 
 HOMES = {"plain": "dqn", "beacon": "dqn-beacon"}
 SEED, FIRST = 1, {"world": "plain", "weights": "dqn", "seed": "1"}
@@ -109,7 +109,7 @@ def test_removal_is_what_one_gets_by_drawing_every_frame_again(
     for i in range(-1 if w.beacon else 0, len(trunks)):
         left = trunks if i < 0 else np.delete(trunks, i, 0)
         pole = (w.length, 0.0) if w.beacon and i >= 0 else None
-        s = np.concatenate([camera(np.array([pose]), [left], w, pole) for pose in poses])
+        s = np.concatenate([draw_frames(np.array([pose]), [left], w, pole) for pose in poses])
         if (s != before).any():
             with torch.no_grad():
                 found[i] = (q(torch.from_numpy(s)[None])[0].tolist(), s[-1].tobytes())

@@ -31,7 +31,7 @@ from extras.experiments.cockpit_pictures import (
     visit,
 )
 from extras.lessons.expert import DemoConfig, read_demos
-from render import camera
+from render import draw_frames
 
 if not (CHROMIUM.exists() and DRIVER.exists()):
     pytest.skip("needs Debian's packages chromium and chromium-driver", allow_module_level=True)
@@ -176,7 +176,7 @@ def test_a_click_on_a_trunk_takes_it_out_of_the_decision(browser: Chrome, host: 
     until(browser, "removed")
     poses = [drone.pose for _, drone in refly(value(browser, "episode.record"), World())]
     forest = np.delete(np.array(value(browser, "episode.trunks")), trunk, 0)
-    s = camera(np.array(poses[27:31]), [forest] * 4, World())
+    s = draw_frames(np.array(poses[27:31]), [forest] * 4, World())
     q = load_weights(ROOT / "weights/dqn.pt")[0]
     with torch.no_grad():
         values = q(torch.from_numpy(s)[None])[0].tolist()

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
 from functools import partial
 from itertools import product
@@ -60,10 +60,10 @@ def one_after_another(scanned: Sequence, pose: Sequence, w: World, c: Config) ->
     """What `plan` should say."""
     surface = [(d * math.cos(b), d * math.sin(b)) for b, d in zip(*scanned, strict=True)]
     surface = [p for p, d in zip(surface, scanned[1], strict=True) if d < w.laser_range]
-    rates = [w.yaw_rate * (2 * a / (w.actions - 1) - 1) for a in range(w.actions)]
+    rates = [w.yaw_rate * (2 * a / (w.num_actions - 1) - 1) for a in range(w.num_actions)]
     steps = [max(round(seconds / w.dt), 1) for seconds in (0.6, 1.6)]
     values = [[] for _ in rates]
-    for first, then in product(range(w.actions), repeat=2):
+    for first, then in product(range(w.num_actions), repeat=2):
         (x, y, heading), ahead, left, turned, value = pose, 0.0, 0.0, 0.0, 0.0
         for k, rate in enumerate([rates[first]] * steps[0] + [rates[then]] * steps[1]):
             turned += rate * w.dt
@@ -102,7 +102,7 @@ def test_the_planner_adds_up_the_rewards_to_come_in_any_world(
     world = World(
         length=rng.uniform(8, 60), width=rng.uniform(8, 40), back=rng.uniform(0, 3),
         speed=rng.uniform(2, 7), dt=rng.uniform(0.05, 0.15), yaw_rate=rng.uniform(0.3, 1.5),
-        actions=int(rng.integers(2, 6)), laser_range=rng.uniform(3, 15), d_crash=0.6, d_neg=2.5,
+        num_actions=int(rng.integers(2, 6)), laser_range=rng.uniform(3, 15), d_crash=0.6, d_neg=2.5,
         r_safe=rng.uniform(0, 1), r_precrash=-rng.uniform(1, 9), r_crash=-rng.uniform(5, 50),
         goal_radius=rng.uniform(0.5, 4), grid=(3, 3), first=(7.5, -6.0),
     )  # fmt: skip
@@ -258,26 +258,23 @@ def test_the_loss_is_the_sum_of_what_the_settings_ask_for(monkeypatch: pytest.Mo
 
 
 @pytest.fixture(autouse=True)
-def little_to_fly(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def little_to_fly(monkeypatch: pytest.MonkeyPatch) -> None:
     """A validation is two episodes, and so is its baseline."""
     few = partial(fly, random_pilot(np.random.default_rng(0)), blind=True)
     monkeypatch.setattr(deepflight, "VALIDATION", range(10**9, 10**9 + 2))
     monkeypatch.setattr(deepflight, "fly_random", few)
-    deepflight.random_steps.cache_clear()
-    yield
-    deepflight.random_steps.cache_clear()
 
 
-def finish(train: Callable, c: Config, folder: Path, cuts: Sequence[int] = ()) -> Run:
+def finish(c: Config, folder: Path, cuts: Sequence[int] = ()) -> Run:
     """A whole training, saved and resumed after each of these steps."""
     folder.mkdir()
-    run = Run(train, c, folder)
+    run = Run(c, folder)
     for cut in cuts:
         while run.envs.steps < cut:
             next(run.loop)
         run.save()
         keys = "config", "actions", "forests", "agent", "optimizer", "rng", "log"
-        run = Run(train, c, folder, deepflight.load(folder / "checkpoint.pt", *keys))
+        run = Run(c, folder, deepflight.load(folder / "checkpoint.pt", *keys))
     assert run.go() == 0
     return run
 
@@ -319,8 +316,8 @@ def test_interrupted_is_uninterrupted_with_an_expert_demonstrations_and_disparit
 ) -> None:
     c = ExpertConfig(**SMALL, steps=240, demo_updates=3, demos=demos, demo_share=0.25,
                      camera="disparity", bellman=True)  # fmt: skip
-    whole = finish(expert.train, c, tmp_path / "whole")
-    cut = finish(expert.train, c, tmp_path / "cut", cuts=(8, 168, 208))
+    whole = finish(c, tmp_path / "whole")
+    cut = finish(c, tmp_path / "cut", cuts=(8, 168, 208))
     assert_same_training(whole, cut)
     assert whole.replay.scores.any(2).all()
     assert (whole.replay.frames[:, :, 0] == 0).mean() > 0.5, "the sky has no disparity"
@@ -328,7 +325,7 @@ def test_interrupted_is_uninterrupted_with_an_expert_demonstrations_and_disparit
 
 def test_where_q_would_explore_the_expert_flies(tmp_path: Path) -> None:
     c = ExpertConfig(**SMALL, steps=160, epsilon_final=1.0)
-    run = finish(expert.train, c, tmp_path / "run")
+    run = finish(c, tmp_path / "run")
     for drone in run.envs.drones[:2]:
         assert len(drone.actions) == 160 // 8
         alone = VecForest(WORLD, 1, [drone.seed], blind=True)
@@ -340,7 +337,7 @@ def test_where_q_would_explore_the_expert_flies(tmp_path: Path) -> None:
 
 def test_demonstrations_alone_come_before_all_else(tmp_path: Path, demos: str) -> None:
     c = DemoConfig(**SMALL, steps=80, demos=demos, demo_updates=7)
-    run = finish(expert.train, c, tmp_path / "run")
+    run = finish(c, tmp_path / "run")
     updates = {state["step"].item() for state in run.agent.optimizer.state.values()}
     assert updates == {8}, "7 before the first step, and one of step 80"
     assert not run.replay.scores.any(), "nobody asks the expert"
@@ -348,7 +345,7 @@ def test_demonstrations_alone_come_before_all_else(tmp_path: Path, demos: str) -
 
 def test_updates_on_demonstrations_alone_sync_the_target_network_too(demos: str) -> None:
     c, rng = DemoConfig(**SMALL, demos=demos, demo_updates=4), np.random.default_rng(0)
-    replay = expert.load_demos(expert.read_demos(c), c, WORLD, lambda r, drones: r)
+    replay = expert.load_demos(expert.read_demos(c), c, WORLD, lambda r, *_: r)
     assert replay.added == sum(len(episode["actions"]) for episode in expert.read_demos(c))
     for updates, same in ((4, True), (3, False)):  # target_every is 64 steps, of 16 an update
         agent = dqn.Agent(c, 9, rng)
@@ -363,9 +360,9 @@ def test_bad_demonstrations_are_named(tmp_path: Path, demos: str) -> None:
     episodes = expert.read_demos(DemoConfig(demos=demos))
     wrong = [episodes[0] | {"outcome": "time"}]
     with pytest.raises(InputError, match="end elsewhere"):
-        expert.load_demos(wrong, DemoConfig(), WORLD, lambda r, drones: r)
+        expert.load_demos(wrong, DemoConfig(), WORLD, lambda r, *_: r)
     with pytest.raises(InputError, match="0 steps"):
-        expert.load_demos([], DemoConfig(), WORLD, lambda r, drones: r)
+        expert.load_demos([], DemoConfig(), WORLD, lambda r, *_: r)
 
 
 def test_eval_prints_the_laser_pilot_beside_the_shipped_network(

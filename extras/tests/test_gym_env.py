@@ -131,7 +131,7 @@ def circle(env: gymnasium.Env) -> tuple[int, str]:
 
 
 def test_a_world_is_changed_by_keywords_and_an_impossible_one_refused() -> None:
-    slow = gymnasium.make(ID, dt=0.05, actions=3)
+    slow = gymnasium.make(ID, dt=0.05, num_actions=3)
     assert slow.action_space.n == 3 and slow.metadata["render_fps"] == 20
     assert Forest(speed=0.4, dt=2.5).metadata["render_fps"] == 1
     with pytest.raises(ValueError, match="speed"):

@@ -34,7 +34,7 @@ def same(ours: dict, theirs: dict) -> None:
         assert value.dtype == theirs[key].dtype and np.array_equal(value, theirs[key]), key
 
 
-@pytest.mark.parametrize("world", [{}, {"beacon": True, "max_steps": 12, "actions": 5}])
+@pytest.mark.parametrize("world", [{}, {"beacon": True, "max_steps": 12, "num_actions": 5}])
 def test_the_native_vector_flies_as_the_synchronous_one(world: dict) -> None:
     ours = gymnasium.make_vec(ID, num_envs=3, vectorization_mode="vector_entry_point", **world)
     theirs = gymnasium.make_vec(ID, num_envs=3, vectorization_mode="sync", **world)

@@ -1,7 +1,7 @@
 """The flags lead from the textbook to the recipe; committed trainings had these settings."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import pytest
@@ -26,8 +26,9 @@ def settings(training: Training) -> Config:
     """What `train` makes of a training's flags."""
     config = CONFIGS[training.program]
     given = vars(deepflight.parse(["train", *training.flags], config))
-    given = {key: value for key, value in given.items() if hasattr(config, key)}
-    return config(**given, seed=training.seed)
+    names = {f.name for f in fields(config)}
+    given = {key: value for key, value in given.items() if key in names and value is not None}
+    return config(**given | {"seed": training.seed})
 
 
 def test_the_last_rung_is_the_recipe_and_each_rung_changes_what_it_names() -> None:

@@ -9,7 +9,6 @@ import torch
 
 import deepflight
 import dqn
-from extras.lessons import mnih
 from extras.lessons.mnih import MnihConfig, RMSprop, TextbookConfig
 from extras.tests.test_expert import SMALL, assert_same_training, finish, little_to_fly
 
@@ -56,7 +55,7 @@ def test_a_training_with_rmsprop_interrupted_is_uninterrupted(
 ) -> None:
     monkeypatch.setattr(dqn, "BFLOAT16", True)  # and back, after the test
     c = MnihConfig(**SMALL, steps=240)
-    whole = finish(mnih.train, c, tmp_path / "whole")
+    whole = finish(c, tmp_path / "whole")
     assert not dqn.BFLOAT16
     assert isinstance(whole.agent.optimizer, RMSprop)
-    assert_same_training(whole, finish(mnih.train, c, tmp_path / "cut", cuts=(8, 168)))
+    assert_same_training(whole, finish(c, tmp_path / "cut", cuts=(8, 168)))
