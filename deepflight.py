@@ -25,6 +25,8 @@ A seed is a forest, and there are three sets of them:
     validation  [10^9, 2 * 10^9)    may choose which weights best.pt keeps
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
+(Those between were flown while this program was written.)
+
 A run's folder holds config.json, log.csv, best.pt (the weights) and checkpoint.pt.
 
 Legend
@@ -41,17 +43,13 @@ Sources, for all four files
     [Wilson 1927]       Probable inference, the law of succession, and statistical inference, JASA
 """
 
-import signal
-
-if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback of Ctrl-C while torch is imported
-
 import argparse
 import copy
 import io
 import json
 import math
 import os
+import signal
 import sys
 import time
 import zipfile
@@ -72,7 +70,7 @@ import render
 from dqn import InputError, QNetwork, setting
 from env import Drone, Episode, Pilot, VecForest, World, fly
 
-TRAIN_END, TEST_FIRST = 10**9, 4 * 10**9  # forest seeds
+TRAIN_END, TEST_FIRST = 10**9, 4 * 10**9  # seeds of forests
 VALIDATION = range(10**9, 10**9 + 48)
 
 
@@ -88,7 +86,7 @@ class Config(dqn.DQNConfig):
     goal_bonus: float = setting(125.0, "[+] for arrival at the goal; 0: off", 0, 1e6)
     far_bonus: float = setting(200.0, "[+] for leaving by the far edge; 0: off", 0, 1e6)
 
-    # What follows is no setting, but a lesson in extras/ may change it.
+    # No settings, but what a lesson in extras/ may change.
     train: ClassVar[Callable] = staticmethod(dqn.train)
     network: ClassVar[type] = QNetwork
     pilot: ClassVar[str] = "dqn"  # what the trained network is called
@@ -118,12 +116,10 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     changes the task: the paper counts the far edge as a crash, and here it is worth more than
     arrival. So compare by "arrived".
 
-    A policy is a rule that picks the action. One kind of shaping, called potential-based, leaves
-    the best policy as it is [Ng 1999]: it pays gamma * P(s2) - P(s), for any function P of the
-    state, so that along a path it adds up to gamma^T P(end) - P(start), whatever lies between.
-    Ours is not of that kind and changes the best policy, on purpose. With P = 2x half a metre
-    forward from x = 50 would be worth 0.99 * 101 - 100 = -0.01, and 0.99 from x = 0, where ours
-    pays 1.0 everywhere. Every return that is printed or logged is the paper's.
+    So the best way to fly is another one than with r alone, on purpose. Potential-based shaping
+    would not change it [Ng 1999]: it pays gamma * P(s2) - P(s), for a function P of the state. With
+    P = 2x half a metre forward would be worth 0.99 * 101 - 100 = -0.01 at x = 50, and 0.99 at
+    x = 0, where ours pays 1.0 everywhere. Every return that is printed or logged is the paper's.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -197,7 +193,7 @@ class Run:
         scores = [(row[share], row["validation_progress"]) for row in self.log]
         if averaged or scores[-1] > max(scores[:-1], default=(-1, 0)):
             save_weights(self.folder / "best.pt", q, self.c)
-        lines = [self.log[0], *(row.values() for row in self.log)]  # a dict's keys are the head
+        lines = [self.log[0].keys(), *(row.values() for row in self.log)]
         text = "".join(",".join(map(str, line)) + "\n" for line in lines)
         atomic_write(self.folder / "log.csv", text.encode())
         left, speed = (self.c.steps / envs.steps - 1) * seconds / 60, envs.steps / seconds
@@ -240,8 +236,8 @@ def dqn_pilot(q: QNetwork) -> Pilot:
 
 
 def fly_random(seeds: Sequence[int], world: World) -> list[Episode]:
-    """The baseline: 2,000 random episodes or more, equally many in each forest, because the mean of
-    only a hundred could be off by a seventh."""
+    """The baseline: 2,000 random episodes or more, equally many in each forest, because they vary
+    so much in length."""
     pilot, repeats = env.random_pilot(np.random.default_rng(0)), math.ceil(2000 / len(seeds))
     return [e for _ in range(repeats) for e in fly(pilot, seeds, world, blind=True)]
 
@@ -480,8 +476,10 @@ def main(argv: Sequence[str] | None = None, config: type[Config] = Config) -> in
     try:
         training = args.command == "train"
         code = start(args, config).go() if training else evaluate(args, config)
-        print(end="", flush=True)
+        sys.stdout.flush()  # here, so that a full disk is an error of ours
         return code
+    except KeyboardInterrupt:
+        return 130
     except (InputError, OSError, MemoryError, FloatingPointError) as error:
         print(f"deepflight.py: {error}", file=sys.stderr)
         return 2

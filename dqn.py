@@ -28,14 +28,15 @@ be one action only, let all Q be 0 at first, and let every update go all the way
 The truth moves backwards. Three things can go wrong, and DQN has an answer to each:
   * Steps that follow each other are alike (correlated samples), and a network that learns from them
     in that order forgets the rest. So a **replay** keeps transitions, and each update draws some at
-    random. They were made by older, worse agents. That does no harm to y, which asks for the best
-    action in s2 and not for the one that was taken: Q-learning is off-policy.
+    random. They were made by older, worse agents, but y asks for the best action in s2 and not for
+    the one that was taken: Q-learning is off-policy. (Where a target holds several rewards this is
+    only nearly true, see `window`.)
   * Each update of Q also moves the targets. So they come from a **target network** Q^, a copy of Q
     that is synced only now and then.
   * An agent that always does what seems best never finds what is better. So it **explores**: with
     probability epsilon, at first 1 and later 0.05, its action is random (an exploration schedule).
 
-Algorithm 1 of [Mnih15], whose numbers `train` carries:
+Algorithm 1 of [Mnih15]. `train` carries its line numbers:
      1  initialize replay memory D to capacity N
      2  initialize action-value function Q with random weights theta
      3  initialize target action-value function Q^ with weights theta- = theta
@@ -96,7 +97,7 @@ class DQNConfig:
     learning_starts: int = setting(5_000, "control steps before the first update", 1, 10**9)
     update_every: int = setting(4, "control steps per update [Mnih15]", 1, 10**4)
     batch_size: int = setting(32, "transitions per update [Mnih15]", 1, 10**4)
-    target_every: int = setting(2_000, "control steps per target network sync", 1, 10**9)
+    target_every: int = setting(2_000, "control steps per target network sync (ours)", 1, 10**9)
     epsilon_final: float = setting(0.05, "share of random actions in the end; at first 1", 0, 1)
     epsilon_decay: int = setting(40_000, "control steps until epsilon_final", 1, 10**9)
     lr: float = setting(2.5e-4, "learning rate of Adam [Mnih15: of RMSprop]", 0, 1)
@@ -104,16 +105,17 @@ class DQNConfig:
     double: bool = setting(True, "[+] Double DQN [van Hasselt 2016]; --no-double: off", 0, 1)
     n_steps: int = setting(5, "[+] true rewards in a target; 1: off", 1, 100)
     mirror: bool = setting(True, "[+] reflect half of every batch; --no-mirror: off", 0, 1)
-    huber_delta: float = setting(10.0, "[+] errors beyond pull equally hard; 1: Mnih's", 1e-3, 1e6)
+    huber_delta: float = setting(10.0, "[+] greater TD errors pull no harder; 1: Mnih's", 1e-3, 1e6)
     lr_decay: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
-    swa_fraction: float = setting(0.1, "[+] last share of steps, averaged to fly; 0: off", 0, 0.5)
+    swa_fraction: float = setting(0.1, "[+] last share, whose weights are averaged; 0: off", 0, 0.5)
 
     def __post_init__(self) -> None:
         for f in fields(self):
             legal, value = f.metadata["legal"], getattr(self, f.name)
             if f.type is not str and not legal[0] <= value <= legal[1]:
                 raise InputError(f"{f.name} is {value}, allowed are {legal[0]:,g} to {legal[1]:,g}")
-        # The least to draw from: three rows that complete a stack, n_steps that wait for rewards.
+        # The least that `sample` can draw from: one row, three before it for its observation, and
+        # n_steps after it for its rewards.
         least = self.num_envs * (self.n_steps + 4)
         if min(self.replay_size, self.learning_starts) < least:
             raise InputError(f"replay_size and learning_starts must be {least} or more")
@@ -138,7 +140,7 @@ class QNetwork(nn.Module):
     def __init__(self, actions: int) -> None:
         super().__init__()
         self.conv = nn.Sequential(
-            *(nn.Conv2d(4, 32, 8, 4), nn.ReLU()),  # (B, 32, 20, 20): 32 filters, 8x8, move on by 4
+            *(nn.Conv2d(4, 32, 8, 4), nn.ReLU()),  # (B, 32, 20, 20): 4 frames, 32 filters of 8x8
             *(nn.Conv2d(32, 64, 4, 2), nn.ReLU()),  # (B, 64, 9, 9)
             *(nn.Conv2d(64, 64, 3, 1), nn.ReLU()),  # (B, 64, 7, 7)
             nn.Flatten(),  # (B, 3136)
@@ -197,8 +199,8 @@ class Replay:
         reward     1    1   -10   0    0    2      the episode of rows 0 to 2 ends in a crash
 
         observation of row 3: D D D D, of row 5: D D E F
-        target of row 1: r = 1 + gamma * -10, and the episode ends there
-        target of row 3: r = 0 + gamma * 0, and s2 is the observation of row 5
+        from row 1: r = 1 + gamma * -10, and the episode ends there
+        from row 3: r = 0 + gamma * 0, and s2 is the observation of row 5
     """
 
     def __init__(self, capacity: int, num_envs: int) -> None:
@@ -294,14 +296,15 @@ def mirror(b: Batch, actions: int, rng: Generator) -> Batch:
 class Agent(nn.Module):
     """What learning changes: Q, the target network Q^, the optimizer, and the mean of Q's weights.
 
-    [+swa_fraction] One update changes how Q flies, and the mean of the weights after each of many
-    updates hardly changes (stochastic weight averaging). So the mean is what flies in the end.
+    [+swa_fraction] Each update changes how Q flies, for better or worse. The mean of the weights
+    over many updates is steadier (stochastic weight averaging), so it is what flies in the end.
 
     Adam keeps two running means for each weight: m of its gradient g, and v of g^2. A running mean
     goes a small part of the way to each new number: m = 0.9 * m + 0.1 * g. The weight moves by
     -lr * m / (sqrt(v) + eps), so all weights move about equally fast. (Adam also corrects for m and
     v starting at 0.) Only weights with tiny gradients move less, because of eps. Rainbow has 1.5e-4
-    [Hessel 2018]. Gradients grow with huber_delta, so our eps does too: it is ten times as large.
+    [Hessel 2018] where no error pulls harder than 1. Ours may pull 10 times as hard (huber_delta),
+    so our eps is 10 times as large.
     """
 
     def __init__(self, c: DQNConfig, actions: int, rng: Generator) -> None:

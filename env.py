@@ -19,7 +19,7 @@ a new frame from its camera. Each step earns a reward, which says how good the s
     | in the air, d_obs from 2.0 to 0.75 m | r_near + r_goal                                     |
     | in a crash, d_obs < 0.75 m           | r_crash                                             |
     | outside: x < -2, x > 90, abs(y) > 25 | r_crash                                             |
-    | at the goal, or out of time          | as in the air                                       |
+    | within 3 m of the goal, or too late  | as in the air                                       |
 
     r_safe = 0.25    r_crash = -10    r_goal = 1 - d_goal / d_max, 0 at the start and 1 at the goal
     r_near falls in a straight line from 0 at d_neg = 2.0 m to r_precrash = -5 at d_crash = 0.75 m
@@ -46,7 +46,7 @@ Legend
     d_max     m, the forest's length
     psi       rad, the heading
     N         trunks
-    E         drones side by side that are active: their episodes have not ended before the step
+    E         active drones: those whose episodes have not ended
     [DF]      the Deep Flight paper; "authors' simulator" is the code released with it
     ours      a number that neither gives
 
@@ -191,9 +191,10 @@ class Drone:
 
     def episode(self) -> Episode:
         """The episode so far: seed, actions as one digit each, and what came of them."""
-        flown = {"seed": self.seed, "actions": "".join(map(str, self.actions))}
-        flown |= {"outcome": self.outcome, "steps": len(self.actions)}
-        return flown | {"progress": self.progress, "return": self.total}
+        return {
+            "seed": self.seed, "actions": "".join(map(str, self.actions)), "outcome": self.outcome,
+            "steps": len(self.actions), "progress": self.progress, "return": self.total,
+        }  # fmt: skip
 
 
 class VecForest:
@@ -210,7 +211,7 @@ class VecForest:
         self.world, self.num_actions, self.blind = world, world.num_actions, blind
         self.drones, self.seeds = [Drone(world) for _ in range(num_envs)], iter(seeds)
         self.episodes: list[Episode] = []  # all that have ended
-        self.history: list[bytes] = []  # the actions of every pass, one byte an active drone
+        self.history: list[bytes] = []  # all actions: one byte for each active drone
         self.steps = 0  # control steps of all drones together
 
     @property
@@ -220,9 +221,9 @@ class VecForest:
 
     def reset_done(self) -> ndarray:
         """Begin an episode where none is active; returns all observations (E, 4, 84, 84) uint8."""
-        # Drones come first in this zip, or it would take a seed too many and lose it.
-        for drone, seed in zip([d for d in self.drones if d.outcome], self.seeds, strict=False):
-            drone.reset(seed)
+        for drone in self.drones:
+            if drone.outcome and (seed := next(self.seeds, None)) is not None:
+                drone.reset(seed)
         begun = [drone for drone in self.active if not drone.actions]
         for drone, frame in zip(begun, self.look(begun), strict=True):
             drone.observation = np.repeat(frame[None], STACK, 0)  # (4, 84, 84)

@@ -36,8 +36,8 @@ A pinhole camera has two rules:
     equally spaced on the image plane, and not in angle.
   * A point h metres above the camera at depth z appears in row 41.5 - 42 * h / z. Depth is measured
     along the optical axis. With the distance along the ray instead, straight walls would look bent.
-The trunk above ends 4 m above the camera and begins 2 m below it, so at depth 9.6 it fills its
-column from row 41.5 - 42 * 4 / 9.6 = 24.0 down to row 41.5 + 42 * 2 / 9.6 = 50.25.
+The trunk of the example is 9.6 m away. Its top is 4 m higher than the camera, its foot 2 m lower,
+so it fills the rows from 41.5 - 42 * 4 / 9.6 = 24.0 to 41.5 + 42 * 2 / 9.6 = 50.25.
 
 The disparity camera draws the same outlines, but a pixel says how near its point is: 255 at 2 m and
 nearer, half of that at 4 m, 0 in the sky. Paint and light do not change it, so a pilot that learns
@@ -97,7 +97,7 @@ def raycast(
     centres: ndarray, radius: ndarray | float, bearings: ndarray,
     camera_of: ndarray | int = 0, cameras: int = 1,
 ) -> tuple[ndarray, ndarray]:  # fmt: skip
-    """Find what each ray of each camera hits first. Cameras must stand outside all trunks.
+    """Find what each ray of each camera hits first. No camera may stand inside a trunk.
 
     The trunks of all cameras are in one list. centres (N, 2): how far ahead and to the left of its
     camera each trunk stands, m. camera_of (N,): which camera that is. radius: m, one, or (N,).
@@ -180,11 +180,10 @@ def draw_frames(
     camera_of = np.repeat(np.arange(len(poses)), [len(forest) for forest in trunks])  # (N,)
     seen = np.concatenate([seen_from(*pair) for pair in zip(poses, trunks, strict=True)])  # (N, 2)
     ahead, left = seen.T  # (N,), (N,) m
-    # Keep what may be in view: between the frame's edges at 45 degrees, with two radii to spare
-    # because a trunk is wide (sqrt(2) of them would do).
-    in_view = (ahead > 0) & (ahead < scene.view) & (np.abs(left) < ahead + 2 * scene.trunk_radius)
-    visible = seen[in_view], scene.trunk_radius, BEARINGS, camera_of[in_view], len(poses)
-    distance, cosine = raycast(*visible)  # (E, 84), (E, 84)
+    # Keep what may be in view: between the frame's edges at 45 degrees, and a trunk's width beyond.
+    keep = (ahead > 0) & (ahead < scene.view) & (np.abs(left) < ahead + 2 * scene.trunk_radius)
+    n, radius = len(poses), scene.trunk_radius
+    distance, cosine = raycast(seen[keep], radius, BEARINGS, camera_of[keep], n)  # (E, 84) both
     grey = scene.trunk_grazing + (scene.trunk_facing - scene.trunk_grazing) * cosine  # (E, 84)
     mask, value = layer(distance, scene.trunk_height, grey, distance, scene)
     frames = mask * value + ~mask * background(scene)  # (E, 84, 84) uint8
@@ -192,9 +191,9 @@ def draw_frames(
         return frames
     goal = np.concatenate([seen_from(pose, np.array([beacon])) for pose in poses])  # (E, 2) m
     radius = np.maximum(scene.beacon_radius, scene.beacon_pixels / 2 / FOCAL * goal[:, 0])  # (E,) m
-    pole, cosine = raycast(goal, radius, BEARINGS, np.arange(len(poses)), len(poses))  # (E, 84)
+    pole, _ = raycast(goal, radius, BEARINGS, np.arange(n), n)  # (E, 84)
     hidden = mask & (distance < pole)[:, None]  # (E, 84, 84) by a nearer trunk
-    mask, value = layer(pole, scene.beacon_height, scene.beacon_grey, 0 * cosine, scene)
+    mask, value = layer(pole, scene.beacon_height, scene.beacon_grey, np.zeros_like(pole), scene)
     return np.where(mask & ~hidden, value, frames)
 
 
