@@ -19,13 +19,18 @@ LABELS = {
     "longer": "longer than random, %", "return": "return",
 }  # fmt: skip
 FRONT = {  # heading -> file, pilot
+    "DQN, seed 0": ("dqn", "dqn"),
+    "seed 1": ("dqn-1", "dqn"),
+    "seed 2": ("dqn-2", "dqn"),
+    "with the beacon": ("dqn-beacon", "dqn"),
+}
+FULL = {
     "DQN": ("dqn", "dqn"),
     "DQN, beacon": ("dqn-beacon", "dqn"),
     "imitation": ("imitation", "imitation"),
     "imitation, beacon": ("imitation-beacon", "imitation"),
+    "laser": ("imitation", "laser"),
 }
-FULL = FRONT | {"laser": ("imitation", "laser")}
-SEEDS = {f"seed {i}": (name, "dqn") for i, name in enumerate(("dqn", "dqn-1", "dqn-2"))}
 
 
 def read(name: str) -> dict[str, Any]:
@@ -49,20 +54,6 @@ def markdown(columns: dict[str, tuple[str, str]]) -> str:
     return "\n".join(lines)
 
 
-def seeds() -> str:
-    """The seeds of the recipe in a sentence."""
-    pilots = [read(file)["pilots"][pilot] for file, pilot in SEEDS.values()]
-    arrived, crossed = (
-        ", ".join(f"{100 * pilot[key]['value']:.0f}" for pilot in pilots)
-        for key in ("goal", "crossed")
-    )
-    returns = ", ".join(f"{pilot['return']['value']:.0f}" for pilot in pilots)
-    return (
-        f"Seeds 0, 1 and 2 of `train`: {arrived} % arrived, {crossed} % crossed, "
-        f"returns of {returns}."
-    )
-
-
 def front() -> str:
     """What `eval` prints, from results/eval.json."""
     report, out = read("eval"), io.StringIO()
@@ -80,6 +71,6 @@ def outcomes(file: str, pilot: str) -> str:
 
 
 if __name__ == "__main__":
-    print(front(), markdown(FRONT), markdown(FULL), markdown(SEEDS), sep="\n\n")
+    print(front(), markdown(FRONT), markdown(FULL), sep="\n\n")
     for name in FULL.values():
         print(*name, outcomes(*name))
