@@ -427,7 +427,7 @@ function save() {
   Object.assign(document.createElement("a"), { href: URL.createObjectURL(file), download: "episodes.json" }).click();
   const flags = (beacon ? " --beacon" : "") + (camera === "grey" ? "" : ` --camera ${camera}`);
   say(`Episodes in the file episodes.json: ${episodes.length}.${left}
-    To learn from them: .venv/bin/python -m extras.lessons.expert demonstrations train --demos FILE --demo-pilot you${flags}`);
+    To learn from them: .venv/bin/python -m extras.lessons.demonstrations train --demos FILE --demo-pilot you${flags}`);
 }
 
 // -------------------------------------------------- keys and buttons

@@ -41,12 +41,13 @@ from extras.experiments.ladder import (
     main,
     metrics,
 )
-from extras.lessons.expert import DemoConfig, laser_pilot, load_demos, pretrain
+from extras.lessons.demonstrations import DemoConfig, load_demos, pretrain
+from extras.lessons.expert import laser_pilot
 
 STEPS, SEEDS, SHOWN, COUNTS = 60_000, (0, 1), 32, (8, 32, 128, 512)
 DEMO_FILE, RESULT = ROOT / "runs/demos.json", ROOT / "results/demonstrations.json"
 EXPERT = ("-m", "extras.lessons.expert")
-DEMOS, FILE = (*EXPERT, "demonstrations"), ("--demos", "runs/demos.json")
+DEMOS, FILE = ("-m", "extras.lessons.demonstrations"), ("--demos", "runs/demos.json")
 KINDS = {  # label -> program, flags
     "from scratch": (RECIPE, ()),
     "demonstrations before": (DEMOS, FILE),

@@ -30,7 +30,7 @@ from extras.experiments.cockpit_pictures import (
     value,
     visit,
 )
-from extras.lessons.expert import DemoConfig, read_demos
+from extras.lessons.demonstrations import DemoConfig, read_demos
 from render import draw_frames
 
 if not (CHROMIUM.exists() and DRIVER.exists()):
@@ -355,7 +355,7 @@ def demonstrated(browser: Chrome) -> list[tuple[int, str]]:
 def test_saved_episodes_are_whole_and_a_training_reads_them(browser: Chrome, host: str) -> None:
     record = steered(browser, host)
     assert demonstrated(browser) == [(SEED, record["actions"])]
-    assert "demonstrations train --demos FILE --demo-pilot you" in text(browser, "hint")
+    assert "lessons.demonstrations train --demos FILE --demo-pilot you" in text(browser, "hint")
     pilots = {"you": {"episodes": [record]}}
     assert json.loads(saved(browser).read_text()) == {
         "beacon": False, "camera": "grey", "pilots": pilots

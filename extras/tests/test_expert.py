@@ -1,9 +1,8 @@
-"""The planner against a loop of single steps, losses by hand, interrupted trainings."""
+"""The planner against a loop of single steps, the loss by hand, interrupted trainings."""
 
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -15,10 +14,9 @@ import torch
 import deepflight
 import dqn
 from deepflight import Config, Run
-from dqn import InputError
 from env import Drone, VecForest, World, fly, random_pilot, reward
-from extras.lessons import expert
-from extras.lessons.expert import DemoConfig, ExpertBatch, ExpertConfig, ExpertReplay, plan, scan
+from extras.lessons import expert, run
+from extras.lessons.expert import ExpertBatch, ExpertConfig, ExpertReplay, plan, scan
 
 WORLD = World()
 CLEARING = replace(WORLD, grid=(0, 0))  # no trunks
@@ -149,39 +147,16 @@ def test_the_laser_pilot_arrives_and_never_crashes() -> None:
 # -------------------------------------------------- settings
 
 
-def test_the_two_recipes_differ_from_dqn_s_in_what_their_comments_say() -> None:
-    own, base = {f.name for f in fields(DemoConfig)} - {*asdict(Config())}, asdict(Config())
-    for config, expected in (
-        (DemoConfig, {"epsilon_decay": 1}),
-        (ExpertConfig, dict(
-            learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000, lr_decay=0.0,
-            forward_reward=1.0, far_bonus=115.0,
-        )),
-    ):  # fmt: skip
-        found = {k: x for k, x in asdict(config()).items() if k not in own and x != base[k]}
-        assert found == expected
-    assert (ExpertConfig().imitation, ExpertConfig().bellman) == (True, False)
-    assert (DemoConfig().imitation, DemoConfig().bellman) == (False, True)
+def test_the_recipe_differs_from_dqn_s_in_what_its_comment_says() -> None:
+    own, base = asdict(ExpertConfig()), asdict(Config())
+    assert {key: own[key] for key in own if own[key] != base.get(key)} == dict(
+        learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000, lr_decay=0.0,
+        forward_reward=1.0, far_bonus=115.0, bellman=False,
+    )  # fmt: skip
     assert (ExpertConfig.pilot, ExpertConfig.validate_every) == ("imitation", 20_000)
-    with pytest.raises(InputError, match="nothing to learn from"):
-        ExpertConfig(imitation=False)
 
 
-# -------------------------------------------------- losses and batches
-
-
-def test_the_margin_loss_is_how_far_the_demonstrated_action_is_from_the_best_by_the_margin() -> (
-    None
-):
-    rng = np.random.default_rng(0)
-    q, a = rng.normal(0, 5, (500, 9)), rng.integers(9, size=500)
-    missed = []
-    for values, demonstrated in zip(q, a, strict=True):
-        others = max(x for i, x in enumerate(values) if i != demonstrated)
-        missed.append(max(others + 3.0 - values[demonstrated], 0))
-    loss = expert.margin_loss(torch.from_numpy(q), torch.from_numpy(a), 3.0)
-    assert loss.numpy() == pytest.approx(missed)
-    assert 0 < np.count_nonzero(missed) < 500
+# -------------------------------------------------- the loss and batches
 
 
 def test_imitation_moves_advantages_to_those_of_the_scores_and_not_the_level() -> None:
@@ -197,20 +172,20 @@ def test_imitation_moves_advantages_to_those_of_the_scores_and_not_the_level() -
     assert (q[1] - q[1, 0]).tolist() == pytest.approx([0, 0, 0], abs=1e-3)
 
 
-def filled(envs: VecForest, reward: float, is_demo: bool = False) -> ExpertReplay:
+def filled(envs: VecForest) -> ExpertReplay:
     """30 rows, whose frames, actions and scores tell the row; 2 environments."""
-    replay, none = ExpertReplay(80, envs, is_demo), np.zeros(2, bool)
+    replay, none = ExpertReplay(80, envs), np.zeros(2, bool)
     for t in range(30):
         envs.scores = np.arange(18).reshape(2, 9) + 100 * t
         s = np.full((2, 4, 84, 84), t, np.uint8)
         s[..., 0] = 255  # the left column, which a reflection moves
-        replay.add(s, np.full(2, t % 9), np.full(2, reward), s, none, none)
+        replay.add(s, np.full(2, t % 9), np.full(2, 40.0), s, none, none)
     return replay
 
 
 def test_scores_come_back_with_their_observation_and_turn_round_with_it() -> None:
     rng = np.random.default_rng(0)
-    b = filled(VecForest(WORLD, 2, []), 1.0).sample(200, 1, 0.9, rng)
+    b = filled(VecForest(WORLD, 2, [])).sample(200, 1, 0.9, rng)
     t = b.s[:, 3, 0, 40].long()  # (B,)
     assert (b.scores[:, 0] // 100 == t).all()
     assert {*(b.scores[:, 0] % 100).tolist()} == {0, 9}, "of both environments"
@@ -224,34 +199,28 @@ def test_scores_come_back_with_their_observation_and_turn_round_with_it() -> Non
         assert twin.a[i] == a
 
 
-def test_a_share_of_each_batch_is_demonstrated_and_at_first_all_of_it() -> None:
-    envs, rng = VecForest(WORLD, 2, []), np.random.default_rng(0)
-    own, demos = filled(envs, 1.0), filled(envs, 2.0, is_demo=True)
-    c = DemoConfig(n_steps=1, demo_share=0.25)
-    for replay, demo_replay, n in ((own, None, 0), (own, demos, 8), (demos, None, 32)):
-        b = expert.sample(replay, demo_replay, c, rng)
-        assert len(b.r) == 32
-        assert b.is_demo.sum() == n
-        assert torch.equal(b.is_demo, b.r == 2)
+def td_loss_by_hand(agent: dqn.Agent, b: dqn.Batch) -> float:
+    """The loss of dqn.learn where all errors are beyond huber_delta."""
+    with torch.no_grad():
+        q, q2, online = agent.q(b.s), agent.q_target(b.s2), agent.q(b.s2)
+    errors = dqn.td_target(b, q2, online) - q.gather(1, b.a[:, None])[:, 0]  # (B,)
+    assert (errors > 10).all(), "beyond huber_delta the loss is 10 * abs(error) - 50"
+    return (10 * errors - 50).mean().item()
 
 
-def test_the_loss_is_the_sum_of_what_the_settings_ask_for(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("bellman", [False, True])
+def test_the_loss_is_that_of_imitation_and_with_bellman_of_td_targets_too(
+    bellman: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(dqn, "BFLOAT16", False)
-    envs, rng = VecForest(WORLD, 2, []), np.random.default_rng(0)
-    b = filled(envs, 40.0, is_demo=True).sample(32, 2, 0.9, rng)
-    b.is_demo[:16] = False
-    for imitation, bellman in ((True, False), (False, True), (True, True)):
-        c = DemoConfig(imitation=imitation, bellman=bellman, margin=3.0)
-        agent = dqn.Agent(c, 9, rng)
-        with torch.no_grad():
-            q, q2, online = agent.q(b.s), agent.q_target(b.s2), agent.q(b.s2)
-        errors = dqn.td_target(b, q2, online) - q.gather(1, b.a[:, None])[:, 0]  # (B,)
-        assert (errors > 10).all(), "beyond huber_delta the loss is 10 * abs(error) - 50"
-        expected = 10 * expert.margin_loss(q, b.a, 3.0)[16:].sum() / 32
-        expected += bellman * (10 * errors - 50).mean()
-        expected += imitation * expert.imitation_loss(q, b.scores, 10.0)
-        expert.learn(agent, b, c)
-        assert agent.loss == pytest.approx(expected.item(), rel=1e-4)
+    rng = np.random.default_rng(0)
+    b = filled(VecForest(WORLD, 2, [])).sample(32, 2, 0.9, rng)
+    agent = dqn.Agent(c := ExpertConfig(bellman=bellman), 9, rng)
+    with torch.no_grad():
+        expected = expert.imitation_loss(agent.q(b.s), b.scores, 10.0).item()
+    expected += bellman * td_loss_by_hand(agent, b)
+    expert.learn(agent, b, c)
+    assert agent.loss == pytest.approx(expected, rel=1e-4)
 
 
 # -------------------------------------------------- trainings
@@ -302,20 +271,8 @@ def flat(x: object) -> object:
             yield value
 
 
-@pytest.fixture
-def demos(tmp_path: Path) -> str:
-    """A file as eval --json writes it, two episodes of the laser pilot."""
-    episodes = fly(expert.laser_pilot(0.99), [0, 1], WORLD, blind=True)
-    path = tmp_path / "demos.json"
-    path.write_text(json.dumps({"pilots": {"random": {}, "laser": {"episodes": episodes}}}))
-    return str(path)
-
-
-def test_interrupted_is_uninterrupted_with_an_expert_demonstrations_and_disparity(
-    tmp_path: Path, demos: str
-) -> None:
-    c = ExpertConfig(**SMALL, steps=240, demo_updates=3, demos=demos, demo_share=0.25,
-                     camera="disparity", bellman=True)  # fmt: skip
+def test_an_imitation_of_disparity_interrupted_is_uninterrupted(tmp_path: Path) -> None:
+    c = ExpertConfig(**SMALL, steps=240, camera="disparity", bellman=True)
     whole = finish(c, tmp_path / "whole")
     cut = finish(c, tmp_path / "cut", cuts=(8, 168, 208))
     assert_same_training(whole, cut)
@@ -335,43 +292,12 @@ def test_where_q_would_explore_the_expert_flies(tmp_path: Path) -> None:
             alone.step([a])
 
 
-def test_demonstrations_alone_come_before_all_else(tmp_path: Path, demos: str) -> None:
-    c = DemoConfig(**SMALL, steps=80, demos=demos, demo_updates=7)
-    run = finish(c, tmp_path / "run")
-    updates = {state["step"].item() for state in run.agent.optimizer.state.values()}
-    assert updates == {8}, "7 before the first step, and one of step 80"
-    assert not run.replay.scores.any(), "nobody asks the expert"
-
-
-def test_updates_on_demonstrations_alone_sync_the_target_network_too(demos: str) -> None:
-    c, rng = DemoConfig(**SMALL, demos=demos, demo_updates=4), np.random.default_rng(0)
-    replay = expert.load_demos(expert.read_demos(c), c, WORLD, lambda r, *_: r)
-    assert replay.added == sum(len(episode["actions"]) for episode in expert.read_demos(c))
-    for updates, same in ((4, True), (3, False)):  # target_every is 64 steps, of 16 an update
-        agent = dqn.Agent(c, 9, rng)
-        expert.pretrain(agent, replay, replace(c, demo_updates=updates), rng)
-        pairs = zip(agent.q.parameters(), agent.q_target.parameters(), strict=True)
-        assert all(torch.equal(*pair) for pair in pairs) == same
-
-
-def test_bad_demonstrations_are_named(tmp_path: Path, demos: str) -> None:
-    with pytest.raises(InputError, match="no episodes of a pilot called me"):
-        expert.read_demos(DemoConfig(demos=demos, demo_pilot="me"))
-    episodes = expert.read_demos(DemoConfig(demos=demos))
-    wrong = [episodes[0] | {"outcome": "time"}]
-    with pytest.raises(InputError, match="end elsewhere"):
-        expert.load_demos(wrong, DemoConfig(), WORLD, lambda r, *_: r)
-    with pytest.raises(InputError, match="0 steps"):
-        expert.load_demos([], DemoConfig(), WORLD, lambda r, *_: r)
-
-
 def test_eval_prints_the_laser_pilot_beside_the_shipped_network(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shipped = Path(deepflight.__file__).parent / "weights/imitation.pt"
-    words = ["expert", "eval", "--weights", str(shipped), "--episodes", "2", "--out", str(tmp_path)]
-    monkeypatch.setattr("sys.argv", words)
+    words = ["eval", "--weights", str(shipped), "--episodes", "2", "--out", str(tmp_path)]
     monkeypatch.setattr(deepflight.render, "save_film", lambda *film: None)
-    assert expert.main() == 0
+    assert run(ExpertConfig, words) == 0
     head = capsys.readouterr().out.splitlines()[2].split()
     assert head == ["random", "straight", "laser", "imitation"]

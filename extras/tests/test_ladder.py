@@ -10,15 +10,12 @@ import deepflight
 from deepflight import Config
 from extras.experiments import demonstrations, ladder
 from extras.experiments.ladder import RECIPE, ROOT, RUNGS, Training
-from extras.lessons.expert import DemoConfig, ExpertConfig
 from extras.lessons.mnih import MnihConfig, TextbookConfig
 
 CONFIGS = {
     RECIPE: Config,
     ladder.MNIH: MnihConfig,
     (*ladder.MNIH, "textbook"): TextbookConfig,
-    demonstrations.EXPERT: ExpertConfig,
-    demonstrations.DEMOS: DemoConfig,
 }
 
 
@@ -39,11 +36,8 @@ def test_the_last_rung_is_the_recipe_and_each_rung_changes_what_it_names() -> No
         assert {key for key in higher if higher[key] != lower[key]} == named
 
 
-@pytest.mark.parametrize("experiment", [ladder, demonstrations])
-def test_each_training_has_a_folder_of_its_own_and_the_committed_ones_these_settings(
-    experiment: object,
-) -> None:
-    trainings = list(experiment.trainings())
+def test_each_training_has_a_folder_of_its_own_and_the_committed_ones_these_settings() -> None:
+    trainings = list(ladder.trainings())
     assert len({training.name for training in trainings}) == len(trainings)
     for training in trainings:
         c = settings(training)
