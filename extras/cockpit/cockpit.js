@@ -28,7 +28,7 @@ const isQ = () => world().weights[chosen.weights] === "dqn"; // an imitated netw
 const score = () => (isQ() ? "Q" : "score");
 const byHand = () => chosen.pilot === "you";
 const steers = () => byHand() && t === end() && !over();
-const straight = () => (world().actions - 1) / 2;
+const straight = () => (world().num_actions - 1) / 2;
 const number = (x) => (Math.round(10 * x) / 10 || 0).toFixed(1).replace("-", "−"); // never −0.0
 const clock = (moment) => `${(moment * world().dt).toFixed(1)} s`;
 const signed = (x) => (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).replace(/^0/, "");
@@ -266,14 +266,14 @@ function show(moment) {
 
 // -------------------------------------------------- drawing
 function drawForest() {
-  const { length, width, back, actions, beacon } = world();
+  const { length, width, back, num_actions, beacon } = world();
   set($("map"), { viewBox: `-4 ${-width / 2 - 2} ${length + 8} ${width + 4}` });
   set($("ground"), { x: -back, y: -width / 2, width: length + back, height: width });
   set($("goal"), { cx: length });
   set($("pole"), { cx: length, r: beacon ? 0.7 : 0 });
   const circle = ([cx, y]) => set(document.createElementNS("http://www.w3.org/2000/svg", "circle"), { cx, cy: -y });
   $("trunks").replaceChildren(...episode.trunks.map(circle));
-  for (let a = actions - 1; a >= 0 && $("bars").children.length < actions; a--) {
+  for (let a = num_actions - 1; a >= 0 && $("bars").children.length < num_actions; a--) {
     const bar = addButton($("bars"), "", () => attempt(() => whatIf(a)));
     bar.innerHTML = `<span></span><span class="well"><i></i><i class="other"></i></span><span class="rate">${rate(a)}</span><span class="after"></span>`;
   }
