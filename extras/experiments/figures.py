@@ -1,4 +1,4 @@
-"""Draw the README's pictures from results/: the paper's Figures 2 to 4, and more; not the atlas.
+"""Draw the README's pictures from results/: the paper's Figures 2 to 4, and more.
 
     extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.experiments.figures

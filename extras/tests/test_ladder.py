@@ -8,17 +8,14 @@ import pytest
 
 import deepflight
 from deepflight import Config
-from extras.experiments import demonstrations, ladder
+from extras.experiments import ladder
 from extras.experiments.ladder import RECIPE, ROOT, RUNGS, Training
-from extras.lessons.expert import DemoConfig, ExpertConfig
 from extras.lessons.mnih import MnihConfig, TextbookConfig
 
 CONFIGS = {
     RECIPE: Config,
     ladder.MNIH: MnihConfig,
     (*ladder.MNIH, "textbook"): TextbookConfig,
-    demonstrations.EXPERT: ExpertConfig,
-    demonstrations.DEMOS: DemoConfig,
 }
 
 
@@ -39,11 +36,8 @@ def test_the_last_rung_is_the_recipe_and_each_rung_changes_what_it_names() -> No
         assert {key for key in higher if higher[key] != lower[key]} == named
 
 
-@pytest.mark.parametrize("experiment", [ladder, demonstrations])
-def test_each_training_has_a_folder_of_its_own_and_the_committed_ones_these_settings(
-    experiment: object,
-) -> None:
-    trainings = list(experiment.trainings())
+def test_each_training_has_a_folder_of_its_own_and_the_committed_ones_these_settings() -> None:
+    trainings = list(ladder.trainings())
     assert len({training.name for training in trainings}) == len(trainings)
     for training in trainings:
         c = settings(training)
@@ -76,13 +70,11 @@ def test_an_interrupted_training_goes_on_and_a_finished_one_is_left_alone(
         assert lines == ([expected] if expected else [])
 
 
-def test_both_pictures_are_drawn_from_the_committed_numbers(
+def test_the_picture_is_drawn_from_the_committed_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "figures").mkdir()
     (tmp_path / "results").symlink_to(ROOT / "results")
-    for experiment in (ladder, demonstrations):
-        monkeypatch.setattr(experiment, "ROOT", tmp_path)
-        experiment.draw()
-    for name in ("ladder", "demonstrations"):
-        assert (tmp_path / f"figures/{name}.png").stat().st_size > 10_000
+    monkeypatch.setattr(ladder, "ROOT", tmp_path)
+    ladder.draw()
+    assert (tmp_path / "figures/ladder.png").stat().st_size > 10_000
