@@ -9,7 +9,7 @@ import pytest
 import deepflight
 from deepflight import Config
 from extras.experiments import ladder
-from extras.experiments.ladder import RECIPE, ROOT, RUNGS, Training
+from extras.experiments.ladder import PANELS, RECIPE, ROOT, RUNGS, Training
 from extras.lessons.mnih import MnihConfig, TextbookConfig
 
 CONFIGS = {
@@ -78,3 +78,13 @@ def test_the_picture_is_drawn_from_the_committed_numbers(
     monkeypatch.setattr(ladder, "ROOT", tmp_path)
     ladder.draw()
     assert (tmp_path / "figures/ladder.png").stat().st_size > 10_000
+
+
+def test_the_page_shows_what_was_flown() -> None:
+    page = (ROOT / "results/README.md").read_text()
+    for label, seeds in ladder.flown().items():
+        cells = [" "] * 3
+        for seed, found in seeds.items():
+            best = (factor * found["best"][key]["value"] for key, (_, factor) in PANELS.items())
+            cells[int(seed)] = f" {' / '.join(f'{x:.0f}' for x in best)} "
+        assert f"| {label} |{'|'.join(cells)}|\n" in page

@@ -140,5 +140,5 @@ def test_the_page_shows_what_was_flown() -> None:
     for name in LIGHT | STEREO:
         cells = (flown[name]["crossed"]["value"] if name in flown else None
                  for flown in report.values())  # fmt: skip
-        line = "".join("  |" if x is None else f" {100 * x:.1f} |" for x in cells)
+        line = "".join(" |" if x is None else f" {100 * x:.1f} |" for x in cells)
         assert f"| {name} |{line}\n" in page
