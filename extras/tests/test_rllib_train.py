@@ -22,8 +22,8 @@ from dqn import Agent
 from env import World
 from extras.bridges.rllib_train import ROOT, RLlibConfig, main, make_config, start, train
 
-PASSED = re.compile(r" *([\d,]+) steps, +\d+ a second")
-ADDED = re.compile(r"node .*: ([\d,]+) steps, \d+ a second, .*?(lost.*)?$")
+PASSED = re.compile(r"^ *([\d,]+) steps, +\d+ a second")
+ADDED = re.compile(r"^node .*: ([\d,]+) steps, \d+ a second, .*?(lost.*)?$")
 
 
 @pytest.mark.long
@@ -53,7 +53,9 @@ def test_a_training_on_three_nodes_outlives_one_of_them(tmp_path: Path) -> None:
         command += ["--address", cluster.address, "--out", str(out)]
         command += ["--steps", "5100"]  # the last hundred learn
         environ = os.environ | {"OMP_NUM_THREADS": "1"}  # the runners need the other cores
-        with subprocess.Popen(command, cwd=ROOT, env=environ, stdout=-1, text=True) as run:
+        with subprocess.Popen(
+            command, cwd=ROOT, env=environ, stdout=subprocess.PIPE, text=True
+        ) as run:
             for line in run.stdout:
                 passed += PASSED.findall(line)
                 added += ADDED.findall(line.rstrip())
