@@ -69,13 +69,13 @@ from numpy.random import Generator
 
 import deepflight
 import env
-from env import World
 from extras.lessons import recipe
 from extras.lessons.expert import ExpertConfig
 from render import PIXELS, SLOPES, Scene, background, draw_frames, shade
 
 ROOT = Path(__file__).parents[2]
 RESULT, FORESTS = ROOT / "results/transfer.json", range(6 * 10**9, 6 * 10**9 + 200)
+METRICS = ("crossed", "crash")
 Trunks = Sequence[ndarray]  # the forest (N, 2) in m of each drone
 
 
@@ -238,18 +238,16 @@ LooksConfig = recipe(
 def fly_all() -> None:
     """Fly each pilot whose weights are there in each look of its camera; print and write."""
     report = json.loads(RESULT.read_text()) if RESULT.exists() else {}
-    random = deepflight.fly_random(FORESTS, World())
-    draws = np.random.default_rng(0).integers(len(FORESTS), size=(2000, len(FORESTS)))
     for pilot, path in PILOTS.items():
         if path.exists():
             q, world, _ = deepflight.load_weights(path)
             for name, look in LOOKS[world.camera].items():
                 with seeing(partial(wear, look)):
                     episodes = env.fly(deepflight.dqn_pilot(q), FORESTS, world)
-                found = deepflight.summarize(episodes, random, draws)
-                found = {key: found[key] for key in ("crossed", "crash", "longer", "return")}
+                shares = {key: float(deepflight.measure(episodes)[key].mean()) for key in METRICS}
+                print(f"{pilot}, {name}:", shares, flush=True)
+                found = {key: deepflight.wilson(p, len(FORESTS)) for key, p in shares.items()}
                 report.setdefault(pilot, {})[name] = found
-                print(pilot, name, *(f"{k} {x['value']:.3f}" for k, x in found.items()), sep=", ")
     RESULT.write_text(json.dumps(report, indent=1) + "\n")
 
 
