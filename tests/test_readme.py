@@ -26,6 +26,13 @@ def test_a_table_of_results_is_generated_from_the_committed_episodes(
     assert tables.markdown(columns) in page
 
 
+def test_the_ratios_of_speed_are_those_that_the_bench_wrote() -> None:
+    for name, value in tables.read("bench")["ratios"].items():
+        peer = name.rsplit(" / ")[1] if name.startswith("environment") else name
+        (row,) = (line for line in RESULTS.splitlines() if line.startswith(f"| {peer} |"))
+        assert f" {value:.2f} |" in row
+
+
 @pytest.mark.parametrize("name", ["dqn", "dqn-1", "dqn-2", "dqn-beacon", "imitation"])
 def test_the_headline_numbers_are_of_the_first_thousand_test_forests(name: str) -> None:
     report = tables.read(name)
@@ -39,7 +46,8 @@ def test_every_file_that_the_pages_link_to_exists() -> None:
             assert (path.parent / link).exists(), (page, link)
 
 
-def test_the_front_page_fits_on_one_page() -> None:
+def test_the_pages_are_short() -> None:
+    assert len(RESULTS.split()) <= 3000
     assert len(README.split()) <= 950
     assert README.count("\n") <= 110
 

@@ -16,9 +16,7 @@ replay of 50,000 transitions lies in this machine's memory; Ray logs to ~/ray_re
 
 At the end the script prints how many steps a second each node added. If a node dies, the others fly
 on, and its runners start again where a CPU is free. The node of this script must live: it holds the
-learner and the replay. We tried three nodes that `ray.cluster_utils.Cluster` made on one machine,
-and killed one midway: extras/experiments/nodes.py does this, and results/nodes.json has what each
-node flew. They shared two cores, so they say little of what machines add.
+learner and the replay. A test kills one of three nodes midway, all on one machine.
 
 We did not try a cluster of several machines. There, start Ray on every machine (`ray start --head`
 on one, `ray start --address HOST:6379` on the others), with this Python and these packages on each,

@@ -13,7 +13,8 @@
 (d) growth: a step among 150, 1,500 and 15,000 trunks, equally dense, resets not counted, one core.
 
 A number is the median of five rounds, a ratio the median of the rounds' ratios. Writes
-results/bench.json and prints the table of results/README.md. The runners are in peers.py.
+results/bench.json and prints the ratios, which results/README.md shows. The runners are in
+peers.py.
 """
 
 import json

@@ -1,12 +1,15 @@
-"""Draw the README's pictures from results/: the paper's Figures 2 to 4, and more; not the atlas.
+"""Draw the README's pictures from results/: the paper's Figures 2 to 4, and more.
 
     extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.experiments.figures
 
 figures/learning.png: a curve is a training, against control steps and against episodes.
 figures/crossed.png: what crosses in the paper's world, beside the laser pilot with and without a
-compass. figures/flight.gif: the first episode of results/eval.json that crosses, flown again, with
-the values that weights/dqn.pt gives to each turn.
+compass.
+figures/transfer.png: the looks of extras/lessons/looks.py, each with the % that cross, by the
+shipped pilot and by the one that was trained with random looks.
+figures/flight.gif: the first episode of results/eval.json that crosses, flown again, with the
+values that weights/dqn.pt gives to each turn.
 """
 
 import json
@@ -21,6 +24,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from deepflight import draw_film, load_weights, measure
+from env import World, plant
+from extras.lessons import looks
 from render import save_film
 
 ROOT = Path(__file__).parents[2]
@@ -88,11 +93,8 @@ def draw_crossed() -> None:
         for seed, log in enumerate(logs(folders)):
             width = max(25_000 // int(log["step"][0]), 1)  # validations in a mean
             share = np.convolve(100 * log["validation_crossed"], np.ones(width) / width, "valid")
-            name = f"{label}, seed {seed}"
-            line = ("-", "--", "-.")[seed]
-            axes.plot(
-                log["step"][width - 1 :], share, colour, linestyle=line, label=name, linewidth=1.2
-            )
+            style = {"linestyle": ("-", "--", "-.")[seed], "label": f"{label}, seed {seed}"}
+            axes.plot(log["step"][width - 1 :], share, colour, linewidth=1.2, **style)
     laser = json.loads((ROOT / "results/compass.json").read_text())
     for way, line in (("straight on", ":"), ("by compass", "--")):
         y = laser[f"the laser pilot, {way}: crossed, %"]
@@ -102,11 +104,28 @@ def draw_crossed() -> None:
     finish(figure, "crossed.png")
 
 
+def draw_looks() -> None:
+    """Five tiles a row: what the network sees, and how many of its episodes cross."""
+    report = json.loads(looks.RESULT.read_text())
+    tiles = [(camera, *item) for camera, flown in looks.LOOKS.items() for item in flown.items()]
+    figure, panels = plt.subplots(-(-len(tiles) // 5), 5, figsize=(8.7, 8.5), layout="constrained")
+    pose, trunks = np.array([[43.0, -12.85, 0.19]]), [plant(looks.FORESTS[0], World())]
+    for axes, (camera, name, look) in zip(panels.flat, tiles, strict=False):
+        pilots = [report[pilot][name] for pilot in report if pilot.startswith(camera)]
+        shares = " / ".join(f"{100 * pilot['crossed']['value']:.0f}" for pilot in pilots)
+        frame = looks.wear(look, pose, trunks, World(camera=camera))[0]
+        axes.imshow(frame, "gray", vmin=0, vmax=255)
+        axes.set_title(f"{camera}: {name}\ncrossed {shares} %", fontsize=9)
+        axes.axis("off")
+    finish(figure, "transfer.png")
+
+
 def main() -> None:
-    """The curves, then the film."""
+    """The curves, the looks, then the film."""
     report = json.loads((ROOT / "results/eval.json").read_text())
     draw_learning(report)
     draw_crossed()
+    draw_looks()
     q, world, name = load_weights(ROOT / "weights/dqn.pt")
     episodes = report["pilots"][name]["episodes"]
     shown = episodes[measure(episodes)["crossed"].argmax()]

@@ -8,8 +8,8 @@ import pytest
 
 import deepflight
 from deepflight import Config
-from extras.experiments import demonstrations, ladder
-from extras.experiments.ladder import RECIPE, ROOT, RUNGS, Training
+from extras.experiments import ladder
+from extras.experiments.ladder import PANELS, RECIPE, ROOT, RUNGS, Training
 from extras.lessons.mnih import MnihConfig, TextbookConfig
 
 CONFIGS = {
@@ -70,13 +70,21 @@ def test_an_interrupted_training_goes_on_and_a_finished_one_is_left_alone(
         assert lines == ([expected] if expected else [])
 
 
-def test_both_pictures_are_drawn_from_the_committed_numbers(
+def test_the_picture_is_drawn_from_the_committed_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "figures").mkdir()
     (tmp_path / "results").symlink_to(ROOT / "results")
-    for experiment in (ladder, demonstrations):
-        monkeypatch.setattr(experiment, "ROOT", tmp_path)
-        experiment.draw()
-    for name in ("ladder", "demonstrations"):
-        assert (tmp_path / f"figures/{name}.png").stat().st_size > 10_000
+    monkeypatch.setattr(ladder, "ROOT", tmp_path)
+    ladder.draw()
+    assert (tmp_path / "figures/ladder.png").stat().st_size > 10_000
+
+
+def test_the_page_shows_what_was_flown() -> None:
+    page = (ROOT / "results/README.md").read_text()
+    for label, seeds in ladder.flown().items():
+        cells = [" "] * 3
+        for seed, found in seeds.items():
+            best = (factor * found["best"][key]["value"] for key, (_, factor) in PANELS.items())
+            cells[int(seed)] = f" {' / '.join(f'{x:.0f}' for x in best)} "
+        assert f"| {label} |{'|'.join(cells)}|\n" in page

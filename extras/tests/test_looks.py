@@ -1,18 +1,23 @@
 """Looks change what the camera delivers, and never where a trunk stands."""
 
+import json
 from dataclasses import asdict
 
 import numpy as np
 import pytest
 
+import deepflight
 import env
-from env import World, plant
-from extras.experiments.looks import LOOKS, STEREO, Look, draw_look, seeing, wear, wear_at_random
+from env import VecForest, World, plant
+from extras.lessons import looks
+from extras.lessons.looks import Look, LooksConfig, random_look, seeing, wear, wear_at_random
 from render import background, draw_frames
 
 POSES = np.array([[0.0, 0.0, 0.0], [30.0, 3.0, 0.5], [70.0, -9.0, -2.0]])
 FORESTS = [plant(seed, World()) for seed in range(3)]
 GREY, DEPTH = World(), World(camera="disparity")
+LIGHT, STEREO = looks.LOOKS["grey"], looks.LOOKS["disparity"]
+HAZES = ("plain", "no haze", "thick haze")
 
 
 @pytest.mark.parametrize("world", [GREY, DEPTH])
@@ -20,26 +25,26 @@ def test_the_plain_look_is_what_the_camera_draws(world: World) -> None:
     assert (wear(Look(), POSES, FORESTS, world) == draw_frames(POSES, FORESTS, world)).all()
 
 
-@pytest.mark.parametrize("name", [name for name in LOOKS if name != "plain"])
+@pytest.mark.parametrize("name", [name for name in LIGHT if name != "plain"])
 def test_every_look_changes_a_grey_frame(name: str) -> None:
-    seen = wear(LOOKS[name], POSES, FORESTS, GREY)
+    seen = wear(LIGHT[name], POSES, FORESTS, GREY)
     assert (seen != draw_frames(POSES, FORESTS, GREY)).mean() > 0.01
 
 
-@pytest.mark.parametrize("name", [n for n, look in LOOKS.items() if "view" not in look.scene])
+@pytest.mark.parametrize("name", [n for n in LIGHT if n not in HAZES])
 def test_but_for_the_air_no_look_changes_disparity(name: str) -> None:
-    assert (wear(LOOKS[name], POSES, FORESTS, DEPTH) == draw_frames(POSES, FORESTS, DEPTH)).all()
+    assert (wear(LIGHT[name], POSES, FORESTS, DEPTH) == draw_frames(POSES, FORESTS, DEPTH)).all()
 
 
 def test_haze_ends_the_view_of_a_stereo_camera_and_leaves_what_is_near() -> None:
     plain = draw_frames(POSES, FORESTS, DEPTH)
-    thick = wear(LOOKS["thick haze"], POSES, FORESTS, DEPTH)
+    thick = wear(LIGHT["thick haze"], POSES, FORESTS, DEPTH)
     far = plain < 255 * DEPTH.near / 15  # farther than haze lets it see
     assert (thick[~far] == plain[~far]).all()
     assert (thick[far] <= plain[far]).all()
 
 
-@pytest.mark.parametrize("name", STEREO)
+@pytest.mark.parametrize("name", [name for name in STEREO if name not in HAZES])
 def test_every_stereo_error_changes_disparity_and_leaves_the_sky_above_most_trunks(
     name: str,
 ) -> None:
@@ -50,7 +55,7 @@ def test_every_stereo_error_changes_disparity_and_leaves_the_sky_above_most_trun
 
 def test_rings_stand_on_trunks_alone() -> None:
     plain = draw_frames(POSES, FORESTS, GREY)
-    seen = wear(LOOKS["striped bark"], POSES, FORESTS, GREY)
+    seen = wear(LIGHT["striped bark"], POSES, FORESTS, GREY)
     trunk = draw_frames(POSES, FORESTS, DEPTH) > background(DEPTH)
     assert (seen == plain)[~trunk].all()
     assert 0.2 < (seen != plain)[trunk].mean() < 0.8
@@ -78,11 +83,13 @@ def test_a_look_at_random_is_a_function_of_forest_and_pose(world: World) -> None
     assert (wear_at_random(POSES[:1], FORESTS[1:2], world) != together[0]).any()
 
 
-@pytest.mark.parametrize(("kind", "flown"), [("grey", LOOKS), ("disparity", STEREO)])
-def test_the_ranges_of_training_hold_every_look_that_is_flown(kind: str, flown: dict) -> None:
+@pytest.mark.parametrize("camera", looks.LOOKS)
+def test_the_ranges_of_training_hold_every_look_that_is_flown(camera: str) -> None:
     rng = np.random.default_rng(0)
-    drawn = [flat(draw_look(kind, rng)) for _ in range(3000)]
-    for look in map(flat, flown.values()):
+    drawn = [flat(random_look(camera, rng)) for _ in range(3000)]
+    haze = HAZES if camera == "disparity" else ()
+    flown = [look for name, look in looks.LOOKS[camera].items() if name not in haze]
+    for look in map(flat, flown):
         for key, value in look.items():
             values = [d[key] for d in drawn if key in d]
             assert min(values) <= value <= max(values), key
@@ -100,3 +107,38 @@ def test_the_eyes_are_given_back() -> None:
         assert env.draw_frames is wear_at_random
         raise KeyError
     assert env.draw_frames is plain
+
+
+def test_the_drones_of_a_training_see_random_looks_and_others_do_not() -> None:
+    c = LooksConfig(steps=8)
+    envs = VecForest(World(), c.num_envs, range(c.num_envs))
+    loop = LooksConfig.train(c, envs, np.random.default_rng(0), deepflight.shaped_reward)
+    next(loop)
+    seen = envs.reset_done()[:, -1]  # (L, 84, 84)
+    forests = [drone.trunks for drone in envs.drones]
+    assert (seen == wear_at_random(np.zeros((c.num_envs, 3)), forests, World())).all()
+    loop.close()
+    plain = VecForest(World(), c.num_envs, range(c.num_envs)).reset_done()[:, -1]
+    assert (plain == draw_frames(np.zeros((c.num_envs, 3)), forests, World())).all()
+    assert (plain != seen).mean() > 0.1
+
+
+def test_the_numbers_of_the_header() -> None:
+    bright = Look({"trunk_facing": 220, "trunk_grazing": 220})
+    trunk = np.array([[9.0, 0.0]])  # its surface is 8.5 m away
+    grey = (Look(), GREY, 46), (bright, GREY, 192)
+    depth = (Look(), DEPTH, 60), (bright, DEPTH, 60), (STEREO["whole steps"], DEPTH, 52)
+    for look, world, level in (*grey, *depth):
+        frame = wear(look, np.zeros((1, 3)), [trunk], world)[0]
+        assert int(frame[41, 41]) == pytest.approx(level, abs=1)
+
+
+def test_the_page_shows_what_was_flown() -> None:
+    report = json.loads(looks.RESULT.read_text())
+    assert [*report] == [*looks.PILOTS]
+    page = (looks.ROOT / "results/README.md").read_text()
+    for name in LIGHT | STEREO:
+        cells = (flown[name]["crossed"]["value"] if name in flown else None
+                 for flown in report.values())  # fmt: skip
+        line = "".join(" |" if x is None else f" {100 * x:.1f} |" for x in cells)
+        assert f"| {name} |{line}\n" in page

@@ -3,6 +3,8 @@
 Every test but those of the command line is long.
 """
 
+import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,13 +14,16 @@ import numpy as np
 import pytest
 import ray
 import torch
+from ray.cluster_utils import Cluster
 
 import deepflight
 from deepflight import load_weights
 from dqn import Agent
 from env import World
 from extras.bridges.rllib_train import ROOT, RLlibConfig, main, make_config, start, train
-from extras.experiments.nodes import fly, kill, number
+
+PASSED = re.compile(r"^ *([\d,]+) steps, +\d+ a second")
+ADDED = re.compile(r"^node .*: ([\d,]+) steps, \d+ a second, .*?(lost.*)?$")
 
 
 @pytest.mark.long
@@ -39,13 +44,32 @@ def test_two_runners_train_a_network_that_flies(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_training_on_three_nodes_outlives_one_of_them(tmp_path: Path) -> None:
-    out = tmp_path / "rllib.pt"
-    passed, added = fly(3, steps=5_100, out=out, midway=kill)  # the last hundred steps learn
-    steps = [number(line[1]) for line in passed]
+    out, passed, added = tmp_path / "rllib.pt", [], []
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})  # all on this machine
+    try:
+        for _ in range(2):
+            cluster.add_node(num_cpus=1)
+        command = [sys.executable, "-m", "extras.bridges.rllib_train", "--runners", "3"]
+        command += ["--address", cluster.address, "--out", str(out)]
+        command += ["--steps", "5100"]  # the last hundred learn
+        environ = os.environ | {"OMP_NUM_THREADS": "1"}  # the runners need the other cores
+        with subprocess.Popen(
+            command, cwd=ROOT, env=environ, stdout=subprocess.PIPE, text=True
+        ) as run:
+            for line in run.stdout:
+                passed += PASSED.findall(line)
+                added += ADDED.findall(line.rstrip())
+                if len(cluster.worker_nodes) == 2 and passed:  # let its processes say no goodbye
+                    cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+    finally:
+        cluster.shutdown()
+    assert run.returncode == 0
+    steps = [int(text.replace(",", "")) for text in passed]
     assert steps[0] < 2_000 and steps[-1] >= 5_100, "it ended before, or with, the node"
-    flown = [number(line[1]) for line in added]
+    flown = [int(text.replace(",", "")) for text, _ in added]
     assert len(flown) == 3 and sum(flown) == steps[-1], "a step is counted nowhere, or twice"
-    assert [number(line[1]) for line in added if line[3]] == [min(flown)], "one node was lost"
+    lost = [steps for steps, (_, why) in zip(flown, added, strict=True) if why]
+    assert lost == [min(flown)], "one node was lost"
     assert load_weights(out)[1:] == (World(), "rllib")
     pilot = ["eval", "--weights", str(out), "--episodes", "2"]
     command = [sys.executable, "deepflight.py", *pilot, "--out", str(tmp_path)]
