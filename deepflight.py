@@ -25,14 +25,9 @@ A seed is a forest, and there are three sets of them:
     validation  [10^9, 2 * 10^9)    may choose which weights best.pt keeps
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
-(Those between were flown while this program was written.)
-
 A run's folder holds config.json, log.csv, best.pt (the weights) and checkpoint.pt.
 
-Legend
-    L  drones side by side in a training
-    F  episodes
-    A  actions
+Legend: L drones side by side in a training, F episodes, A actions.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -76,7 +71,7 @@ VALIDATION = range(10**9, 10**9 + 48)
 
 @dataclass(frozen=True)
 class Config(dqn.DQNConfig):
-    """All settings; each is a flag of `train`. [+] marks what is ours, as in dqn.py."""
+    """All settings; each is a flag of `train`. [+] as in dqn.py: not in the textbook."""
 
     seed: int = setting(0, "of everything random", 0, 10**18)
     beacon: bool = setting(False, "[+] put a visible pole at the goal", 0, 1)
@@ -114,10 +109,10 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     far_bonus: no frame shows which edge is the far one, so a drone that leaves does not know
     whether it gets -10 or 188. The bonus makes this risk worth taking; 200 was found by trial. It
     changes the task: the paper counts the far edge as a crash, and here it is worth more than
-    arrival. So compare by "arrived".
+    arrival. So look at the share that arrived too, and not only at the share that crossed.
 
-    So the best way to fly is another one than with r alone, on purpose. Potential-based shaping
-    would not change it [Ng 1999]: it pays gamma * P(s2) - P(s), for a function P of the state. With
+    On purpose, these parts change which way of flying is best. Potential-based shaping
+    would not [Ng 1999]: it pays gamma * P(s2) - P(s), for a function P of the state. With
     P = 2x half a metre forward would be worth 0.99 * 101 - 100 = -0.01 at x = 50, and 0.99 at
     x = 0, where ours pays 1.0 everywhere. Every return that is printed or logged is the paper's.
     """
@@ -147,8 +142,8 @@ class Run:
         self.rng, self.forests = np.random.default_rng(c.seed), np.random.default_rng([c.seed, 1])
         seeds = (int(self.forests.integers(TRAIN_END)) for _ in count())
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
-        random = fly_random(VALIDATION, self.envs.world)
-        self.random_steps = float(measure(random)["steps"].mean())
+        baseline = fly_random(VALIDATION, self.envs.world)
+        self.random_steps = float(measure(baseline)["steps"].mean())
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)
         self.agent, self.replay = next(self.loop)
         if saved:
@@ -167,11 +162,10 @@ class Run:
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")
                 if dqn.due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
                     self.validate(time.perf_counter() - began)
-                    self.save()
                 if stopped and envs.steps < c.steps:
                     self.save()
                     print(f"saved at step {envs.steps:,}; to go on:", file=sys.stderr)
-                    print(f"{c.command} train --resume '{self.folder}'", file=sys.stderr)
+                    print(f'{c.command} train --resume "{self.folder}"', file=sys.stderr)
                     return 128 + stopped[0]
         return 0
 
@@ -196,6 +190,7 @@ class Run:
         lines = [self.log[0].keys(), *(row.values() for row in self.log)]
         text = "".join(",".join(map(str, line)) + "\n" for line in lines)
         atomic_write(self.folder / "log.csv", text.encode())
+        self.save()
         left, speed = (self.c.steps / envs.steps - 1) * seconds / 60, envs.steps / seconds
         print(ROW.format(**self.log[-1], left=left, speed=speed), flush=True)
 
@@ -218,16 +213,13 @@ class Run:
             s2, r, terminated, truncated, drones = self.envs.step(actions)
             r = shaped_reward(r, drones, self.c)  # (L,)
             self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
-        if self.forests.bit_generator.state != saved["forests"]:
+        if self.forests.bit_generator.state != saved["forests"]:  # more or fewer have begun
             raise InputError(f"{self.folder}: its actions lead to other episodes on this machine")
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state, self.log = saved["rng"], saved["log"]
         if saved["config"]["steps"] != self.c.steps:
             self.agent.mean.n_averaged.zero_()  # a longer training averages its own last share
-
-
-# -------------------------------------------------- eval
 
 
 def dqn_pilot(q: QNetwork) -> Pilot:
@@ -247,12 +239,11 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
     JSON, and a film of the network's first episode that crossed (or of the first)."""
     q, world, name = load_weights(args.weights, config.network)
     seeds, film = range(args.first_seed, args.first_seed + args.episodes), args.out / "flight.gif"
-    if not seeds or seeds[0] < 0 or args.threads < 1:
-        raise InputError("episodes and threads must be 1 or more, and first-seed 0 or more")
+    if not (0 < args.episodes <= 10**6 and args.first_seed >= 0 and 0 < args.threads <= 64):
+        raise InputError("allowed: episodes 1 to 10^6, first-seed 0 or more, threads 1 to 64")
     for path in (film, args.json or film):  # better to fail now than after all episodes
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_dir() or not os.access(path.parent, os.W_OK):
-            raise InputError(f"{path} cannot be written")
+        path.open("ab").close()
     torch.set_num_threads(args.threads)
     print(f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n", flush=True)
     flown = {"random": fly_random(seeds, world)}
@@ -371,7 +362,9 @@ def load(path: Path | str, *keys: str) -> dict[str, Any]:
     """Read what save wrote, without running any code from the file. InputError if it cannot be
     read, is damaged, or does not hold these keys."""
     try:
-        archive = zipfile.ZipFile(path)  # holds checksums, and flags that torch leaves at 0
+        archive = zipfile.ZipFile(
+            path
+        )  # its parts have checksums, and flags that torch leaves at 0
         if archive.testzip() or any(part.external_attr for part in archive.infolist()):
             raise zipfile.BadZipFile
         content = torch.load(path, weights_only=True)
@@ -422,7 +415,7 @@ def stop_signals() -> Iterator[list[int]]:
 
 def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespace:
     """Read the command line; every setting is a flag of `train`."""
-    # Without a usage, what is wrong is said in one line.
+    # argparse prints the usage before an error; without one, the error is a single line.
     silent = {"prog": "deepflight.py", "usage": argparse.SUPPRESS}
     parser = argparse.ArgumentParser(**silent)
     commands = parser.add_subparsers(dest="command", required=True, metavar="train or eval")
@@ -449,8 +442,7 @@ def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespac
 
 def start(args: argparse.Namespace, config: type[Config]) -> Run:
     """Begin a training, or go on with one."""
-    given = {f.name: getattr(args, f.name) for f in fields(config)}
-    given = {name: value for name, value in given.items() if value is not None}
+    given = {f.name: x for f in fields(config) if (x := getattr(args, f.name)) is not None}
     if not args.resume:
         free = (f"{i:03d}" for i in count(1) if not Path(f"runs/{i:03d}").exists())
         folder = Path("runs", args.name or next(free))
@@ -474,8 +466,7 @@ def main(argv: Sequence[str] | None = None, config: type[Config] = Config) -> in
     """Run one command; returns the exit code: 0, 2 after trouble, 128 + n after signal n."""
     args = parse(argv, config)
     try:
-        training = args.command == "train"
-        code = start(args, config).go() if training else evaluate(args, config)
+        code = start(args, config).go() if args.command == "train" else evaluate(args, config)
         sys.stdout.flush()  # here, so that a full disk is an error of ours
         return code
     except KeyboardInterrupt:

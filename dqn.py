@@ -18,7 +18,7 @@ If Q(s, a) is 8, its error is 2.4, and all weights are moved a little so that it
 the TD target (temporal difference), and the equation is Bellman's. A target that is made from
 another estimate bootstraps. That works because each target holds one true reward, and where a crash
 ends an episode the whole target is true. Take three steps with rewards 0.5, 0.5 and -10. Let there
-be one action only, let all Q be 0 at first, and let every update go all the way to its target:
+be one action only, let all Q be 0 at first, and let an update set all three to their targets:
 
                      Q of step 1   step 2   step 3
     after update 1       0.5         0.5     -10
@@ -121,9 +121,6 @@ class DQNConfig:
             raise InputError(f"replay_size and learning_starts must be {least} or more")
 
 
-# -------------------------------------------------- the network
-
-
 class QNetwork(nn.Module):
     """The network of [Mnih15, Methods]: an observation goes in, Q(s, .) of all actions comes out.
 
@@ -163,9 +160,6 @@ class QNetwork(nn.Module):
 def greedy(q: QNetwork, s: ndarray) -> ndarray:
     """The actions (B,) of greatest value for the observations s (B, 4, 84, 84) uint8."""
     return q(torch.from_numpy(s)).argmax(1).numpy()
-
-
-# -------------------------------------------------- the replay
 
 
 class Batch(NamedTuple):
@@ -246,8 +240,8 @@ class Replay:
 
         [+n_steps] With n = 2 the target of Q(s_0, a_0) is r_0 + gamma * r_1 + gamma^2 * (the
         greatest Q^ of s_2): two true rewards, so the truth moves back by two steps in each update.
-        This has a price: r_1 followed from the action in s_1, which an older agent chose. At best
-        it was the best action, so such a target is usually too low.
+        This has a price: r_1 followed from the action in s_1, which an older agent chose. It may
+        have been a worse one than the best, so such a target is often too low.
         """
         rows, envs = (row[:, None] + np.arange(n)) % self.rows, env[:, None]  # (B, n), (B, 1)
         live = self.ends[rows, envs] == LIVE  # (B, n)
@@ -290,9 +284,6 @@ def mirror(b: Batch, actions: int, rng: Generator) -> Batch:
     return b
 
 
-# -------------------------------------------------- learning
-
-
 class Agent(nn.Module):
     """What learning changes: Q, the target network Q^, the optimizer, and the mean of Q's weights.
 
@@ -301,10 +292,9 @@ class Agent(nn.Module):
 
     Adam keeps two running means for each weight: m of its gradient g, and v of g^2. A running mean
     goes a small part of the way to each new number: m = 0.9 * m + 0.1 * g. The weight moves by
-    -lr * m / (sqrt(v) + eps), so all weights move about equally fast. (Adam also corrects for m and
-    v starting at 0.) Only weights with tiny gradients move less, because of eps. Rainbow has 1.5e-4
-    [Hessel 2018] where no error pulls harder than 1. Ours may pull 10 times as hard (huber_delta),
-    so our eps is 10 times as large.
+    -lr * m / (sqrt(v) + eps), so all weights move about equally fast, but for those with gradients
+    below eps. Rainbow's eps is 1.5e-4 [Hessel 2018]. Ours is huber_delta times that, because an
+    error may pull huber_delta times as hard.
     """
 
     def __init__(self, c: DQNConfig, actions: int, rng: Generator) -> None:
@@ -410,11 +400,11 @@ def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator
     agent = Agent(c, envs.num_actions, rng)  # 2, 3
     yield agent, replay
     # step: the number of control steps after this pass; a restored run begins at envs.steps > 0
-    for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):  # 4
+    for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
         agent.optimizer.param_groups[0]["lr"] = lr
-        s = envs.reset_done()  # 5, 6 (L, 4, 84, 84)
+        s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
         random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
         a = np.where(explore, random, greedy(agent.q, s))  # 8 (L,)

@@ -94,10 +94,6 @@ class World(Scene):
     max_steps: int = 1000  # then the episode is truncated, authors' evaluation
     beacon: bool = False  # a pole that makes the goal visible; off in the paper's world
 
-    def __post_init__(self) -> None:
-        if self.speed * self.dt >= self.trunk_radius + self.d_crash:
-            raise ValueError(f"speed {self.speed} m/s: a step could jump through a trunk unseen")
-
 
 def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
     """The reward of one step, [DF §II-A] line by line.
@@ -253,8 +249,6 @@ class VecForest:
         goal = (self.world.length, 0) if self.world.beacon else None
         return draw_frames(poses, [drone.trunks for drone in drones], self.world, goal)
 
-
-# -------------------------------------------------- pilots without a network
 
 Pilot = Callable[[ndarray, VecForest], Sequence[int]]  # observations (E, 4, 84, 84) -> actions (E,)
 

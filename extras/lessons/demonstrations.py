@@ -161,11 +161,11 @@ def train(c: "DemoConfig", envs: VecForest, rng: Generator, shaped: Callable) ->
     if not envs.steps:  # [!] a restored training has done this
         pretrain(agent, demo_replay, c, rng)  # [!]
     # step: the number of control steps after this pass; a restored run begins at envs.steps > 0
-    for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):  # 4
+    for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
         agent.optimizer.param_groups[0]["lr"] = lr
-        s = envs.reset_done()  # 5, 6 (L, 4, 84, 84)
+        s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
         random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
         a = np.where(explore, random, greedy(agent.q, s))  # 8 (L,)

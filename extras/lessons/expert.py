@@ -239,11 +239,11 @@ def train(c: "ExpertConfig", envs: VecForest, rng: Generator, shaped: Callable) 
     agent = Agent(c, envs.num_actions, rng)  # 2, 3
     yield agent, replay
     # step: the number of control steps after this pass; a restored run begins at envs.steps > 0
-    for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):  # 4
+    for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
         agent.optimizer.param_groups[0]["lr"] = lr
-        s = envs.reset_done()  # 5, 6 (L, 4, 84, 84)
+        s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
         rng.integers(envs.num_actions, size=c.num_envs)  # [!] drawn as in dqn.train, not flown
         best = envs.scores.argmax(1)  # (L,) [!]

@@ -83,11 +83,11 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
     agent.optimizer = RMSprop(agent.q.parameters(), c.lr)  # [!]
     yield agent, replay
     # step: the number of control steps after this pass; a restored run begins at envs.steps > 0
-    for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):  # 4
+    for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
         agent.optimizer.param_groups[0]["lr"] = lr
-        s = envs.reset_done()  # 5, 6 (L, 4, 84, 84)
+        s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
         random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
         a = np.where(explore, random, greedy(agent.q, s))  # 8 (L,)
@@ -106,8 +106,8 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
 
 TextbookConfig = recipe(
     "TextbookConfig", Config, command="python -m extras.lessons.mnih textbook",
-    double=False, n_steps=1, mirror=False, huber_delta=1.0,
-    lr_decay=1.0, swa_fraction=0.0, forward_reward=0.0, goal_bonus=0.0, far_bonus=0.0,
+    double=False, n_steps=1, mirror=False, huber_delta=1.0, lr_decay=1.0, swa_fraction=0.0,
+    forward_reward=0.0, goal_bonus=0.0, far_bonus=0.0, beacon_recipe={},
 )  # fmt: skip
 
 # Mnih's table says that the target network is synced every 10,000 updates. His code does it every
