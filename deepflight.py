@@ -224,7 +224,7 @@ class Run:
 
 def dqn_pilot(q: QNetwork) -> Pilot:
     """The pilot that takes the action of greatest value: four frames and nothing else."""
-    return lambda s, envs: dqn.greedy(q, s)
+    return lambda s, envs: dqn.greedy(q, s, *q.senses(envs.active))
 
 
 def fly_random(seeds: Sequence[int], world: World) -> list[Episode]:
@@ -332,7 +332,7 @@ def draw_film(episode: Episode, world: World, q: QNetwork, name: str) -> Iterato
     path = []
     for t, (s, drone) in enumerate(env.refly(episode, world)):
         path.append(drone.pose[:2])
-        values = q(torch.from_numpy(s)[None])[0].numpy()  # (A,)
+        values = q(torch.from_numpy(s)[None], *q.senses([drone]))[0].numpy()  # (A,)
         text = f"{name}: {t * world.dt:.1f} s, {drone.d_goal:.1f} m to the goal\n"
         text += f"reward so far {drone.total:.1f}   {drone.outcome}"
         yield render.draw_panel(s[-1], drone.trunks, np.array(path), drone.outcome, values, text)

@@ -155,11 +155,15 @@ class QNetwork(nn.Module):
             features = self.conv(grey)  # (B, 3136)
         return self.head(features.float())  # (B, A)
 
+    def senses(self, drones: Any) -> tuple:
+        """What these drones tell the network beside frames: nothing here."""
+        return ()
+
 
 @torch.no_grad()
-def greedy(q: QNetwork, s: ndarray) -> ndarray:
+def greedy(q: QNetwork, s: ndarray, *senses: Tensor) -> ndarray:
     """The actions (B,) of greatest value for the observations s (B, 4, 84, 84) uint8."""
-    return q(torch.from_numpy(s)).argmax(1).numpy()
+    return q(torch.from_numpy(s), *senses).argmax(1).numpy()
 
 
 class Batch(NamedTuple):

@@ -39,6 +39,10 @@ def test_the_headline_numbers_are_of_the_first_thousand_test_forests(name: str) 
     assert (report["first_seed"], report["forests"]) == (4 * 10**9, 1000)
 
 
+def test_the_lessons_table_is_generated_from_the_committed_episodes() -> None:
+    assert tables.lessons() in (tables.ROOT / "extras/lessons/README.md").read_text()
+
+
 def test_every_file_that_the_pages_link_to_exists() -> None:
     for page in ("README.md", "results/README.md", "extras/README.md", "extras/lessons/README.md"):
         path = tables.ROOT / page
@@ -54,6 +58,6 @@ def test_the_pages_are_short() -> None:
 
 def test_every_weights_file_that_is_shipped_is_named_after_its_pilot() -> None:
     for path in Path(tables.ROOT / "weights").glob("*.pt"):
-        _, world, pilot = tables.deepflight.load_weights(path)
-        suffix = "-beacon" * world.beacon + "-disparity" * (world.camera == "disparity")
-        assert path.stem == pilot + suffix
+        saved = tables.deepflight.load(path, "pilot", "beacon", "camera")
+        suffix = "-beacon" * saved["beacon"] + "-disparity" * (saved["camera"] == "disparity")
+        assert path.stem == saved["pilot"] + suffix

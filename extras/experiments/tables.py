@@ -32,6 +32,18 @@ FULL = {
     "laser": ("imitation", "laser"),
 }
 
+LESSONS = {
+    "DQN, seed 0": ("dqn", "dqn"),
+    "DQN, seed 1": ("dqn-1", "dqn"),
+    "DQN, seed 2": ("dqn-2", "dqn"),
+    "imitation, seed 0": ("imitation", "imitation"),
+    "imitation, seed 1": ("imitation-1", "imitation"),
+    "32 demonstrations alone, seed 0": ("demonstrations-32", "demonstrations"),
+    "32 demonstrations alone, seed 1": ("demonstrations-32-1", "demonstrations"),
+    "imitation from disparity, seed 0": ("imitation-disparity", "imitation"),
+    "the planner": ("imitation", "laser"),
+}
+
 
 def read(name: str) -> dict[str, Any]:
     """A file that `eval --json` wrote."""
@@ -54,6 +66,22 @@ def markdown(columns: dict[str, tuple[str, str]]) -> str:
     return "\n".join(lines)
 
 
+def minutes(name: str) -> str:
+    """How long a training took by its log, if results/ keeps it."""
+    log = ROOT / "results" / name / "log.csv"
+    return f"{float(log.read_text().split(',')[-1]) / 60:.0f}" if log.exists() else ""
+
+
+def lessons() -> str:
+    """The table of extras/lessons/README.md: one row a pilot, one column a metric."""
+    lines = ["| | " + " | ".join([*LABELS.values(), "minutes"]) + " |", "|---" * 7 + "|"]
+    for label, (name, pilot) in LESSONS.items():
+        cells = [metric(read(name)["pilots"][pilot], key) for key in LABELS]
+        trained = minutes(name) if pilot != "laser" else ""
+        lines.append(f"| {label} | " + " | ".join([*cells, trained]) + " |")
+    return "\n".join(lines)
+
+
 def front() -> str:
     """What `eval` prints, from results/eval.json."""
     report, out = read("eval"), io.StringIO()
@@ -71,6 +99,6 @@ def outcomes(file: str, pilot: str) -> str:
 
 
 if __name__ == "__main__":
-    print(front(), markdown(FRONT), markdown(FULL), sep="\n\n")
+    print(front(), markdown(FRONT), markdown(FULL), lessons(), sep="\n\n")
     for name in FULL.values():
         print(*name, outcomes(*name))

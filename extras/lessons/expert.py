@@ -46,8 +46,9 @@ not how good the observation is. The level of the outputs means nothing, unless 
 
                             crossed   hit a trunk   return
     dqn                     65.6 %       2.0 %       64.4
-    imitation               88.5 %       0.3 %       83.7
-    the planner itself      98.9 %       0.0 %       88.7
+    imitation, seed 0       88.5 %       0.3 %       83.7
+    imitation, seed 1       87.2 %       0.3 %       84.1
+    the planner, no bonus   98.9 %       0.0 %       88.7
 
 With the beacon 90.3 % arrive, at a return of 88.3 (dqn: 90.6 % at 56.9). TD targets beside the
 scores made it worse: after 60,000 steps 54 and 55 % of 200 crossed, without them 72 and 74 %.

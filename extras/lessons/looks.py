@@ -19,15 +19,15 @@ how many pixels a point is shifted between the left and the right picture. That 
 alone. Our frame says 510 / depth, and 255 at most.
 
 In numbers: a trunk stands 8.5 m away. A grey camera sees its bark, grey level 35, through haze that
-ends the view at 40 m: 90 + (35 - 90) * (1 - 8.5 / 40) = 46, darker than the sky's 90. With bark of
-grey level 220 it is 90 + (220 - 90) * (1 - 8.5 / 40) = 192, brighter than the sky. In the frame of
+ends the view at 40 m: 90 + (35 - 90) * (1 - 8.5 / 40) = 46.7, darker than the sky's 90. With bark
+of grey level 220 it is 90 + (220 - 90) * (1 - 8.5 / 40) = 192, brighter than the sky. In the frame of
 disparity it is 510 / 8.5 = 60 in both forests.
 
 A real stereo camera makes errors of its own. It must find each point of the left picture in the
 right one, and on a trunk of one colour it can find only the two edges. Take a pair of pictures 640
 pixels wide, whose lenses stand 12 cm apart. Its focal length is 320 pixels, so the shift is 320 *
-0.12 / 8.5 = 4.5 pixels. If it can tell whole pixels apart only, it says 4. A pixel is 13 of our
-levels, so the frame says 52 in place of 60.
+0.12 / 8.5 = 4.5 pixels. If it can tell whole pixels apart only, it says 4, rounded down. A pixel is
+13 of our levels, so the frame says 52 in place of 60.
 
 **Domain randomization** lets what must not matter vary in the training, so that nothing can be
 learnt from it [Tobin 2017]. Each forest gets a look at random, from ranges that hold all looks in

@@ -1,7 +1,7 @@
 """mnih.py: the optimizer and the settings of [Mnih15], Nature 518, Extended Data Table 1.
 
     python -m extras.lessons.mnih train            his settings; 1.4 million steps, as in the paper
-    python -m extras.lessons.mnih textbook train   no piece marked [+] in dqn.py, but Adam, and our
+    python -m extras.lessons.mnih textbook train   nothing marked [+] but num_envs; Adam, and our
                                                    shorter training
     python -m extras.lessons.mnih eval --weights runs/NAME/best.pt
     python -m extras.lessons.mnih diff             its loop beside that of dqn.py
@@ -22,8 +22,9 @@ each move goes on with 0.95 of the last one, which makes it 6 to 10 times as str
 **What is different from dqn.py**, in two lines of `train`, marked [!], and in its settings:
     BFLOAT16         off: all numbers have 32 bits
     agent.optimizer  RMSprop, at a constant rate
-    TextbookConfig   nothing marked [+]: targets of one reward without Double DQN, a loss that is
-                     straight beyond errors of 1, no mean of the weights, no shaped reward
+    TextbookConfig   nothing marked [+] but num_envs: targets of one reward without Double DQN, a
+                     loss that is straight beyond errors of 1, no mean of the weights, no shaped
+                     reward
     MnihConfig       and his numbers: a replay of a million transitions, a sync every 10,000 steps,
                      epsilon from 1 to 0.1 in a million steps
 Left as they are: eight environments side by side, which only saves time, and rewards that are not

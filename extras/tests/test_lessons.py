@@ -9,9 +9,10 @@ from extras.lessons import run
 from extras.lessons.demonstrations import DemoConfig
 from extras.lessons.expert import ExpertConfig
 from extras.lessons.mnih import MnihConfig, TextbookConfig
+from extras.lessons.pqn import PQNConfig
 
 
-@pytest.mark.parametrize("config", [ExpertConfig, DemoConfig, MnihConfig])
+@pytest.mark.parametrize("config", [ExpertConfig, DemoConfig, MnihConfig, PQNConfig])
 def test_diff_adds_no_line_to_the_loop_that_is_not_marked(
     config: type, capsys: pytest.CaptureFixture
 ) -> None:
