@@ -20,8 +20,8 @@ alone. Our frame says 510 / depth, and 255 at most.
 
 In numbers: a trunk stands 8.5 m away. A grey camera sees its bark, grey level 35, through haze that
 ends the view at 40 m: 90 + (35 - 90) * (1 - 8.5 / 40) = 46.7, darker than the sky's 90. With bark
-of grey level 220 it is 90 + (220 - 90) * (1 - 8.5 / 40) = 192, brighter than the sky. In the frame of
-disparity it is 510 / 8.5 = 60 in both forests.
+of grey level 220 it is 90 + (220 - 90) * (1 - 8.5 / 40) = 192, brighter than the sky. In the frame
+of disparity it is 510 / 8.5 = 60 in both forests.
 
 A real stereo camera makes errors of its own. It must find each point of the left picture in the
 right one, and on a trunk of one colour it can find only the two edges. Take a pair of pictures 640
