@@ -32,15 +32,15 @@ FULL = {
     "laser": ("imitation", "laser"),
 }
 
-LESSONS = {
-    "DQN, seed 0": ("dqn", "dqn"),
-    "DQN, seed 1": ("dqn-1", "dqn"),
-    "DQN, seed 2": ("dqn-2", "dqn"),
+LESSONS = {f"DQN, seed {i}": (name, "dqn") for i, name in enumerate(("dqn", "dqn-1", "dqn-2"))} | {
     "imitation, seed 0": ("imitation", "imitation"),
     "imitation, seed 1": ("imitation-1", "imitation"),
     "32 demonstrations alone, seed 0": ("demonstrations-32", "demonstrations"),
     "32 demonstrations alone, seed 1": ("demonstrations-32-1", "demonstrations"),
     "imitation from disparity, seed 0": ("imitation-disparity", "imitation"),
+    "PQN, seed 0": ("pqn", "pqn"),
+    "memory, seed 0": ("memory", "memory"),
+    "memory, seed 1": ("memory-1", "memory"),
     "the planner": ("imitation", "laser"),
 }
 

@@ -32,6 +32,17 @@ a normal distribution whose standard deviation is 10 degrees a minute.
     Rollout    keeps the four numbers of s and s2 beside them
     learn      passes them on; a reflection changes the sign of the sine and of y
     rewards    arrival pays more than the far edge, because now the drone can find the goal
+
+**What came out**, over 1,000 test forests; pqn and dqn have other bonuses:
+
+                         arrived   crossed   hit a trunk   return
+    dqn                    8.8 %    65.6 %       2.0 %      64.4
+    pqn                    8.9 %    59.4 %       3.8 %     105.9
+    memory, seed 0        21.4 %    97.1 %       2.0 %      55.7
+    memory, seed 1        35.1 %    95.3 %       4.7 %      21.4
+
+With its place the drone can tell the edges apart, and from rewards alone most episodes cross. But
+few arrive, although arrival pays ten times as much as the far edge, and the seeds differ.
 """
 
 import sys
