@@ -18,31 +18,25 @@ LABELS = {
     "goal": "arrived, %", "crossed": "crossed, %", "crash": "hit a trunk, %",
     "longer": "longer than random, %", "return": "return",
 }  # fmt: skip
+SEEDS = "dqn", "dqn-1", "dqn-2"
 FRONT = {  # heading -> file, pilot
-    "DQN, seed 0": ("dqn", "dqn"),
-    "seed 1": ("dqn-1", "dqn"),
-    "seed 2": ("dqn-2", "dqn"),
+    "DQN, seed 0": ("dqn", "dqn"), "seed 1": ("dqn-1", "dqn"), "seed 2": ("dqn-2", "dqn"),
     "with the beacon": ("dqn-beacon", "dqn"),
-}
+}  # fmt: skip
 FULL = {
-    "DQN": ("dqn", "dqn"),
-    "DQN, beacon": ("dqn-beacon", "dqn"),
+    "DQN": ("dqn", "dqn"), "DQN, beacon": ("dqn-beacon", "dqn"),
     "imitation": ("imitation", "imitation"),
-    "imitation, beacon": ("imitation-beacon", "imitation"),
-    "laser": ("imitation", "laser"),
-}
-
-LESSONS = {f"DQN, seed {i}": (name, "dqn") for i, name in enumerate(("dqn", "dqn-1", "dqn-2"))} | {
+    "imitation, beacon": ("imitation-beacon", "imitation"), "laser": ("imitation", "laser"),
+}  # fmt: skip
+LESSONS = {f"DQN, seed {seed}": (name, "dqn") for seed, name in enumerate(SEEDS)} | {
     "imitation, seed 0": ("imitation", "imitation"),
     "imitation, seed 1": ("imitation-1", "imitation"),
     "32 demonstrations alone, seed 0": ("demonstrations-32", "demonstrations"),
     "32 demonstrations alone, seed 1": ("demonstrations-32-1", "demonstrations"),
     "imitation from disparity, seed 0": ("imitation-disparity", "imitation"),
-    "PQN, seed 0": ("pqn", "pqn"),
-    "memory, seed 0": ("memory", "memory"),
-    "memory, seed 1": ("memory-1", "memory"),
-    "the planner": ("imitation", "laser"),
-}
+    "PQN, seed 0": ("pqn", "pqn"), "memory, seed 0": ("memory", "memory"),
+    "memory, seed 1": ("memory-1", "memory"), "the planner": ("imitation", "laser"),
+}  # fmt: skip
 
 
 def read(name: str) -> dict[str, Any]:
