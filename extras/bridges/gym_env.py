@@ -57,6 +57,8 @@ def dress(env: AnyEnv, world: World, num_envs: int, render_mode: str | None, for
     ):
         if value not in allowed:
             raise ValueError(f"{name} is {value!r}, allowed: {allowed}")
+    if world.speed * world.dt >= world.trunk_radius + world.d_crash:
+        raise ValueError(f"speed {world.speed} m/s: a step could jump through a trunk unseen")
     env.envs = VecForest(world, num_envs, ())  # it looks; we reset and step its drones
     env.render_mode, env.numbers = render_mode, RANGES[forests]
     env.metadata = env.metadata | {"render_fps": max(1, round(1 / world.dt))}
