@@ -43,6 +43,8 @@ a normal distribution whose standard deviation is 10 degrees a minute.
 
 With its place the drone can tell the edges apart, and from rewards alone most episodes cross. But
 few arrive, although arrival pays ten times as much as the far edge, and the seeds differ.
+With a drift of 10 degrees a minute, which it never met in training, seed 0 still crosses 95 %
+[89, 98] of 100 validation forests (`memory drift eval --first-seed 1000000048 --episodes 100`).
 """
 
 import sys
