@@ -81,11 +81,11 @@ class Config(dqn.DQNConfig):
     goal_bonus: float = setting(125.0, "[+] for arrival at the goal; 0: off", 0, 1e6)
     far_bonus: float = setting(200.0, "[+] for leaving by the far edge; 0: off", 0, 1e6)
 
-    # No settings, but what a lesson in extras/ may change.
+    # The rest are no settings, but a lesson in extras/ may replace them.
     train: ClassVar[Callable] = staticmethod(dqn.train)
     network: ClassVar[type] = QNetwork
     pilot: ClassVar[str] = "dqn"  # what the trained network is called
-    command: ClassVar[str] = "python deepflight.py"
+    command: ClassVar[str] = f'"{__file__}"'  # what Python is told to run
     baselines: ClassVar[dict[str, Pilot]] = {"straight": env.straight_pilot}
     validate_every: ClassVar[int] = 5_000  # control steps
     # With the beacon the goal can be seen, so arrival should be worth more than the far edge.
@@ -111,10 +111,10 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     changes the task: the paper counts the far edge as a crash, and here it is worth more than
     arrival. So look at the share that arrived too, and not only at the share that crossed.
 
-    On purpose, these parts change which way of flying is best. Potential-based shaping
-    would not [Ng 1999]: it pays gamma * P(s2) - P(s), for a function P of the state. With
-    P = 2x half a metre forward would be worth 0.99 * 101 - 100 = -0.01 at x = 50, and 0.99 at
-    x = 0, where ours pays 1.0 everywhere. Every return that is printed or logged is the paper's.
+    On purpose, these parts change which way of flying is best. Potential-based shaping would not
+    [Ng 1999]: it pays gamma * P(s2) - P(s), for a function P of the state. With P = 2x, half a
+    metre forward would be worth 0.99 * 101 - 100 = -0.01 at x = 50, and 0.99 at x = 0, where ours
+    pays 1.0 everywhere. Every return that is printed or logged is the paper's.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -164,8 +164,8 @@ class Run:
                     self.validate(time.perf_counter() - began)
                 if stopped and envs.steps < c.steps:
                     self.save()
-                    print(f"saved at step {envs.steps:,}; to go on:", file=sys.stderr)
-                    print(f'{c.command} train --resume "{self.folder}"', file=sys.stderr)
+                    command = f'"{sys.executable}" {c.command} train --resume "{self.folder}"'
+                    print(f"saved at step {envs.steps:,}; to go on:\n{command}", file=sys.stderr)
                     return 128 + stopped[0]
         return 0
 
@@ -362,9 +362,7 @@ def load(path: Path | str, *keys: str) -> dict[str, Any]:
     """Read what save wrote, without running any code from the file. InputError if it cannot be
     read, is damaged, or does not hold these keys."""
     try:
-        archive = zipfile.ZipFile(
-            path
-        )  # its parts have checksums, and flags that torch leaves at 0
+        archive = zipfile.ZipFile(path)  # with checksums, and flags that torch leaves at 0
         if archive.testzip() or any(part.external_attr for part in archive.infolist()):
             raise zipfile.BadZipFile
         content = torch.load(path, weights_only=True)

@@ -162,7 +162,8 @@ class QNetwork(nn.Module):
 
 @torch.no_grad()
 def greedy(q: QNetwork, s: ndarray, *senses: Tensor) -> ndarray:
-    """The actions (B,) of greatest value for the observations s (B, 4, 84, 84) uint8."""
+    """The actions (B,) of greatest value for the observations s (B, 4, 84, 84) uint8, and for what
+    else the network is told (nothing, but in a lesson)."""
     return q(torch.from_numpy(s), *senses).argmax(1).numpy()
 
 

@@ -185,7 +185,7 @@ def train(c: "DemoConfig", envs: VecForest, rng: Generator, shaped: Callable) ->
 
 DemoConfig = recipe(
     "DemoConfig", Config,
-    command="python -m extras.lessons.demonstrations", pilot="demonstrations",
+    command="-m extras.lessons.demonstrations", pilot="demonstrations",
     train=staticmethod(train), baselines=Config.baselines | {"laser": laser_pilot(Config.gamma)},
     epsilon_decay=1,
     demos=setting("", "file of episodes that eval --json wrote, or the cockpit"),

@@ -267,7 +267,7 @@ def train(c: "ExpertConfig", envs: VecForest, rng: Generator, shaped: Callable) 
 # a point a metre its return is larger, but it crosses less often.
 ExpertConfig = recipe(
     "ExpertConfig", Config,
-    command="python -m extras.lessons.expert", pilot="imitation", train=staticmethod(train),
+    command="-m extras.lessons.expert", pilot="imitation", train=staticmethod(train),
     baselines=Config.baselines | {"laser": laser_pilot(Config.gamma)}, validate_every=20_000,
     bellman=setting(False, "learn from TD targets too", 0, 1),
     learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000, lr_decay=0.0,

@@ -228,7 +228,7 @@ def train(
 
 LooksConfig = recipe(
     "LooksConfig", ExpertConfig, pilot="looks", train=staticmethod(train),
-    command="python -m extras.lessons.looks",
+    command="-m extras.lessons.looks",
 )  # fmt: skip
 
 

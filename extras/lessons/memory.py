@@ -174,7 +174,7 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
 
 MemoryConfig = recipe(
     "MemoryConfig", PQNConfig,
-    command="python -m extras.lessons.memory", pilot="memory", train=staticmethod(train),
+    command="-m extras.lessons.memory", pilot="memory", train=staticmethod(train),
     network=QNetwork, steps=220_000, lr_decay=0.05, swa_fraction=0.2,
     forward_reward=0.25, goal_bonus=200.0, far_bonus=20.0,
 )  # fmt: skip

@@ -106,7 +106,7 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
 
 
 TextbookConfig = recipe(
-    "TextbookConfig", Config, command="python -m extras.lessons.mnih textbook",
+    "TextbookConfig", Config, command="-m extras.lessons.mnih textbook",
     double=False, n_steps=1, mirror=False, huber_delta=1.0, lr_decay=1.0, swa_fraction=0.0,
     forward_reward=0.0, goal_bonus=0.0, far_bonus=0.0, beacon_recipe={},
 )  # fmt: skip
@@ -115,7 +115,7 @@ TextbookConfig = recipe(
 # 10,000 steps. We follow the code.
 MnihConfig = recipe(
     "MnihConfig", TextbookConfig,
-    command="python -m extras.lessons.mnih", pilot="mnih", train=staticmethod(train),
+    command="-m extras.lessons.mnih", pilot="mnih", train=staticmethod(train),
     steps=1_400_000, replay_size=1_000_000, learning_starts=50_000,
     target_every=10_000, epsilon_final=0.1, epsilon_decay=1_000_000,
 )  # fmt: skip

@@ -209,7 +209,7 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
 # The settings of the replay, of the target network and of n-step targets have no effect here.
 PQNConfig = recipe(
     "PQNConfig", Config,
-    command="python -m extras.lessons.pqn", pilot="pqn", train=staticmethod(train),
+    command="-m extras.lessons.pqn", pilot="pqn", train=staticmethod(train),
     network=QNetwork, validate_every=25_000,
     rollout=setting(16, "control steps of each drone between two updates", 1, 10**4),
     epochs=setting(2, "passes over each rollout", 1, 100),
@@ -218,7 +218,7 @@ PQNConfig = recipe(
     forward_reward=1.0, far_bonus=115.0,
 )  # fmt: skip
 PlainConfig = recipe(
-    "PlainConfig", PQNConfig, command="python -m extras.lessons.pqn plain", pilot="plain",
+    "PlainConfig", PQNConfig, command="-m extras.lessons.pqn plain", pilot="plain",
     network=PlainNetwork, steps=150_000,
 )  # fmt: skip
 
