@@ -15,7 +15,7 @@ let episode = null; // the episode on show: choice, moments, record, actions, tr
 let [ghost, plain] = [null, null]; // another one through the same forest, and its label; the one to go back to
 let t = 0; // the moment on show
 let [reasons, removed] = [null, null]; // the answer to "why" of moment t; what is taken out on show
-let [playing, busy] = [false, false]; // busy: a step is on its way
+let [playing, underway] = [false, null]; // underway: the promise of a step that the server has not answered
 let [generation, asked] = [0, 0]; // of episodes, and of what was asked: what an older one waited for is dropped
 const done = new Map(JSON.parse(sessionStorage.done || "[]")); // flown by hand to their end, each once
 const stick = { held: {}, tapped: {}, side: 0, level: 0 };
@@ -69,6 +69,7 @@ async function attempt(action) {
 // -------------------------------------------------- episodes
 async function begin(actions, moment) {
   const me = ++generation;
+  release();
   pause();
   if (!/^[0-9]{1,18}$/.test(chosen.seed)) throw new Error("The forest is a whole number of at most 18 digits.");
   const found = await extend({ choice: chosen, moments: [] }, actions);
@@ -100,10 +101,10 @@ function help() {
 }
 
 async function steer() {
-  if (busy) return;
-  busy = true;
+  if (underway) return;
   const [me, mine, start] = [generation, asked, performance.now()];
-  await extend(episode, episode.actions + turn()).finally(() => (busy = false));
+  underway = extend(episode, episode.actions + turn()).finally(() => (underway = null));
+  await underway;
   if (me !== generation) return;
   show(end());
   requestAnimationFrame(() => performance.measure("step to frame", { start }));
@@ -120,6 +121,8 @@ function turn() {
   [stick.side, stick.tapped] = [side, {}];
   return straight() + side * stick.level;
 }
+
+const release = () => Object.assign(stick, { held: {}, tapped: {} });
 
 function hold(side, down) {
   stick.held[side] = down ? 1 : 0;
@@ -142,9 +145,9 @@ async function otherwise(from, action, steps) {
 }
 
 async function whatIf(action) {
-  pause();
+  const me = await settle();
+  if (me !== asked) return;
   if (t === end() && over()) return say("The episode ends here. Step back, and ask again.");
-  const me = asked;
   const other = await otherwise(t, action, Number($("hold").value));
   if (me !== asked) return;
   ghost?.words === other.words ? clear() : compare(other); // the same bar again takes it away
@@ -165,10 +168,10 @@ function clear() {
 
 // The last moment at which another turn saves the episode. It is flown, so the answer is exact.
 async function wentWrong() {
-  pause();
+  const [me, steps] = [await settle(), Math.round(0.5 / world().dt)];
+  if (me !== asked) return;
   if (!over()) return say("This episode is not over. Fly it to its end first.");
   if (crossed(episode)) return say(`Nothing went wrong: ${ended(episode)}.`);
-  const [me, steps] = [asked, Math.round(0.5 / world().dt)];
   let from = end();
   while (from >= steps && from > end() - 10 * steps) {
     from -= steps;
@@ -189,8 +192,7 @@ async function wentWrong() {
 
 // -------------------------------------------------- why
 async function why(trunk = null) {
-  pause();
-  const [me, at] = [asked, t];
+  const [me, at] = [await settle(), t];
   const answer = reasons || (await ask("/why", episode.choice, { actions: episode.actions, time: String(at) }));
   if (me !== asked || at !== t) return;
   setReasons(answer, removed && removed.trunk === trunk ? null : trunk);
@@ -229,6 +231,14 @@ function clickMap(event) {
 // -------------------------------------------------- play
 const play = () => playing || setPlaying(true);
 const pause = () => setPlaying(false);
+
+// Before a question: pause, and let a step that is underway arrive, because it moves t.
+async function settle() {
+  pause();
+  const me = asked;
+  await underway;
+  return me;
+}
 
 function setPlaying(on) {
   [playing, asked] = [on, asked + 1];
@@ -450,18 +460,20 @@ function key(event) {
   const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const own = event.target.matches("input, select") || (name === " " && event.target.matches("button"));
   const [side, action] = [SIDES[name], actions[KEYS[name]]];
+  if (side && event.type === "keyup") hold(side, false); // whatever has the focus
   if (own || event.ctrlKey || event.metaKey || event.altKey || !episode || !(side || action)) return;
   event.preventDefault();
-  if (side && !event.repeat) hold(side, event.type === "keydown");
-  if (action && event.type === "keydown") action();
+  if (event.type === "keyup") return;
+  if (side && !event.repeat) hold(side, true);
+  if (action) action();
 }
 
 function listen() {
   const on = (id, event, action) => $(id).addEventListener(event, action);
   for (const type of ["keydown", "keyup"]) document.addEventListener(type, key);
-  window.addEventListener("blur", () => (stick.held = {}));
+  window.addEventListener("blur", release);
   window.addEventListener("hashchange", restore);
-  document.addEventListener("visibilitychange", () => document.hidden && pause());
+  document.addEventListener("visibilitychange", () => document.hidden && (release(), pause()));
   // What was clicked by a mouse would keep the focus, and take the keys that steer.
   document.addEventListener("click", (event) => event.detail && event.target.matches("button, #time") && event.target.blur());
   for (const side of ["left", "right"]) {

@@ -135,6 +135,34 @@ def test_holding_a_key_turns_harder(browser: Chrome, host: str) -> None:
     assert value(browser, "episode.actions").startswith("567888")
 
 
+def test_a_key_that_is_released_elsewhere_is_released(browser: Chrome, host: str) -> None:
+    visit(browser, host, seed=SEED)
+    ActionChains(browser).key_down(Keys.ARROW_LEFT).perform()
+    until(browser, "end() >= 2")
+    click(browser, "seed")
+    ActionChains(browser).key_up(Keys.ARROW_LEFT).perform()
+    assert value(browser, "stick.held") == {"left": 0}
+    ActionChains(browser).key_down("d").perform()  # goes into the field
+    browser.execute_script("document.activeElement.blur()")
+    press(browser, "r")
+    until(browser, "end() === 0 && ghost")
+    press(browser, Keys.SPACE)
+    until(browser, "end() >= 2")
+    assert value(browser, "episode.actions").startswith("44")
+    ActionChains(browser).key_up("d").perform()
+
+
+def test_a_question_waits_for_the_step_that_is_underway(browser: Chrome, host: str) -> None:
+    visit(browser, host, seed=SEED)
+    slow = "extend = (x => async (...a) => (await new Promise(f => setTimeout(f, 300)), x(...a)))"
+    browser.execute_script(f"{slow}(extend)")
+    for question, answer in (("why(149)", "That is in none of"), ("whatIf(8)", "The dashed path")):
+        press(browser, Keys.ARROW_LEFT)
+        until(browser, "underway")
+        value(browser, question)
+        assert text(browser, "hint").startswith(answer)
+
+
 def test_keys_play_pause_step_and_change_the_forest(browser: Chrome, host: str) -> None:
     visit(browser, host, seed=SEED, pilot="network", t=10)
     press(browser, ".", ".", ",")
