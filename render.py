@@ -163,10 +163,9 @@ def layer(
     """
     depth = distance * COSINES  # (E, 84) m, along the optical axis
     value = shade(grey, haze, depth, scene).astype(np.uint8)  # (E, 84)
-    above = np.array([height, 0.0])[:, None, None] - scene.altitude  # (2, 1, 1) m, top and foot
-    rows = np.clip(np.ceil(CENTRE - FOCAL * above / depth), 0, PIXELS)  # (2, E, 84)
-    top, foot = rows.astype(np.uint8)[:, :, None]  # (E, 1, 84) each; equal where depth is inf
-    return (top <= ROWS) & (foot > ROWS), value[:, None]
+    rows = (CENTRE - FOCAL * (h - scene.altitude) / depth for h in (height, 0.0))  # (E, 84) each
+    top, foot = (np.ceil(row).clip(0, PIXELS).astype(np.uint8)[:, None] for row in rows)
+    return (top <= ROWS) & (foot > ROWS), value[:, None]  # top = foot where depth is inf
 
 
 def draw_frames(
@@ -177,19 +176,18 @@ def draw_frames(
     poses (E, 3): x, y in m and heading in rad. trunks: each drone's forest, (N, 2) in m. beacon:
     where the pole at the goal stands, or None; it is visible from any distance.
     """
-    camera_of = np.repeat(np.arange(len(poses)), [len(forest) for forest in trunks])  # (N,)
-    seen = np.concatenate([seen_from(*pair) for pair in zip(poses, trunks, strict=True)])  # (N, 2)
-    ahead, left = seen.T  # (N,), (N,) m
+    seen = seen_from(poses, np.array(trunks))  # (E, N, 2) m
+    ahead, left = seen[..., 0], seen[..., 1]  # (E, N), (E, N) m
     # Keep what may be in view: between the frame's edges at 45 degrees, and a trunk's width beyond.
     keep = (ahead > 0) & (ahead < scene.view) & (np.abs(left) < ahead + 2 * scene.trunk_radius)
-    n, radius = len(poses), scene.trunk_radius
-    distance, cosine = raycast(seen[keep], radius, BEARINGS, camera_of[keep], n)  # (E, 84) both
+    camera_of, n = np.nonzero(keep)[0], len(poses)  # of each trunk that is kept
+    distance, cosine = raycast(seen[keep], scene.trunk_radius, BEARINGS, camera_of, n)  # (E, 84)
     grey = scene.trunk_grazing + (scene.trunk_facing - scene.trunk_grazing) * cosine  # (E, 84)
     mask, value = layer(distance, scene.trunk_height, grey, distance, scene)
     frames = mask * value + ~mask * background(scene)  # (E, 84, 84) uint8
     if beacon is None:
         return frames
-    goal = np.concatenate([seen_from(pose, np.array([beacon])) for pose in poses])  # (E, 2) m
+    goal = seen_from(poses, np.array([beacon]))[:, 0]  # (E, 2) m
     radius = np.maximum(scene.beacon_radius, scene.beacon_pixels / 2 / FOCAL * goal[:, 0])  # (E,) m
     pole, _ = raycast(goal, radius, BEARINGS, np.arange(n), n)  # (E, 84)
     hidden = mask & (distance < pole)[:, None]  # (E, 84, 84) by a nearer trunk
@@ -197,17 +195,17 @@ def draw_frames(
     return np.where(mask & ~hidden, value, frames)
 
 
-def seen_from(pose: ndarray, points: ndarray) -> ndarray:
-    """How far ahead of a drone and to its left these points lie: (N, 2) m.
+def seen_from(poses: ndarray, points: ndarray) -> ndarray:
+    """How far ahead of each drone and to its left its points lie: (E, N, 2) m.
 
-    pose (3,): x, y in m and heading in rad. points (N, 2): x, y in m.
+    poses (E, 3): x, y in m and heading in rad. points (E, N, 2), or (N, 2) for all: x, y in m.
 
-    >>> seen_from(np.array([1.0, 0.0, 0.0]), np.array([[4.0, 2.0]]))
-    array([[3., 2.]])
+    >>> seen_from(np.array([[1.0, 0.0, 0.0]]), np.array([[4.0, 2.0]]))
+    array([[[3., 2.]]])
     """
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    # (x, y) @ this = (x cos + y sin, y cos - x sin), which is (ahead, left)
-    return (points - pose[:2]) @ np.array([[cos, -sin], [sin, cos]])  # (N, 2)
+    x, y = np.moveaxis(points - poses[:, None, :2], -1, 0)  # (E, N), (E, N) m
+    cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])  # (E, 1), (E, 1)
+    return np.stack([x * cos + y * sin, y * cos - x * sin], -1)  # (E, N, 2)
 
 
 # -------------------------------------------------- the film's picture: skip this at first

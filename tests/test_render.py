@@ -144,9 +144,9 @@ def test_the_grounds_disparity_grows_in_a_straight_line_from_the_horizon_down() 
 def test_drawn_side_by_side_is_drawn_alone(beacon: tuple) -> None:
     rng = np.random.default_rng(3)
     for n in (1, 2, 8, 33):
-        forests = [random_trunks(rng, trunks) for trunks in rng.integers(200, size=n)]
+        forests = random_trunks(rng, n * 150).reshape(n, 150, 2)
         poses = np.column_stack([rng.uniform(-0.7, 0.7, (n, 2)), rng.normal(0, 2, n)])
-        poses[-1], forests[-1] = 0.0, np.array([[-5.0, 0.0]])  # the last one sees no trunk
+        poses[-1], forests[-1] = 0.0, (-5.0, 0.0)  # the last one sees no trunk
         frames = draw_frames(poses, forests, SCENE, beacon)
         assert (frames.shape, frames.dtype) == ((n, 84, 84), np.uint8)
         for frame, pose, forest in zip(frames, poses, forests, strict=True):

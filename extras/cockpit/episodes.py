@@ -179,11 +179,12 @@ def without(poses: ndarray, recording: Recording) -> tuple[list[int], ndarray]:
     The names: -2 is nothing, -1 the goal's pole, others are numbers of trunks.
     """
     trunks, world = recording.drone.trunks, recording.world
-    ahead, left = np.stack([seen_from(pose, trunks) for pose in poses]).T  # (N, 4), (N, 4) m
-    # As `camera` does it: two radii to spare, because a trunk is wide.
+    ahead, left = seen_from(poses, trunks).T  # (N, 4), (N, 4) m
+    # As `draw_frames` does it: two radii to spare, because a trunk is wide.
     inside = (ahead > 0) & (ahead < world.view) & (abs(left) < ahead + 2 * world.trunk_radius)
     near = np.flatnonzero(inside.any(1))  # (K,)
-    forests = [trunks, *(np.delete(trunks, i, 0) for i in near)]  # 1 + K of (N, 2), (N - 1, 2) m
+    forests = np.repeat(trunks[None], 1 + len(near), 0)  # (1 + K, N, 2) m
+    forests[np.arange(len(near)) + 1, near] = 1e9  # m: out of sight
     goal = (world.length, 0) if world.beacon else None
     # (4 + 4 K, 3), and as many forests: one for each camera
     cameras, seen = np.tile(poses, (len(forests), 1)), [f for f in forests for _ in poses]
