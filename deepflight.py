@@ -11,21 +11,22 @@ shaped reward, validation, files, then `eval` with its statistics, and the comma
 
 `train` prints a row after each validation:
 
-         step  eps   /s  left  return | return longer  cross  crash
-       15,000 0.64  126   24m   -16.8 |   -6.7   353%    21%     6%
+         step  eps   /s  left  return | return length  cross  crash
+       15,000 0.64  126   24m   -16.8 |   -6.7    119    21%     6%
 
 After 15,000 control steps 64 % of the actions are random. The training makes 126 steps a second,
 and 24 minutes are left. The last 100 training episodes had a mean return of -16.8. Then the network
 flew through 48 validation forests without random actions. Its mean return was -6.7, its episodes
-were 353 % longer than random ones, 21 % crossed the forest, and 6 % crashed. (In tables and logs a
-return is the plain sum of an episode's rewards, without gamma.)
+were 119 steps long (random ones are 27), 21 % crossed the forest, and 6 % crashed. (In tables and
+logs a return is the plain sum of an episode's rewards, without gamma.)
 
 A seed is a forest, and there are three sets of them:
     training    [0, 10^9)
-    validation  [10^9, 2 * 10^9)    may choose which weights best.pt keeps
+    validation  [10^9, 2 * 10^9)    may choose the weights (best.pt)
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
-A run's folder holds config.json, log.csv, best.pt (the weights) and checkpoint.pt.
+A run's folder holds config.json, log.csv, checkpoint.pt, and in best.pt the weights: those of the
+best validation until the last tenth of the steps, and from then on the mean of all since.
 
 Legend: L drones side by side in a training, F episodes, A actions.
 
@@ -100,8 +101,8 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
         + gamma * goal_bonus       0.99 * 125 = 123.75, once      on arrival at the goal
         + gamma * far_bonus        0.99 * 200 = 198, once         on leaving by the far edge
 
-    forward_reward: r depends on where the drone is and not on where it goes, so a drone that
-    wanders about in one place earns as much as one that flies through it.
+    forward_reward: r pays for being somewhere and not for getting on, so a drone that circles in
+    one place earns as much as one that flies past it.
     goal_bonus: arrival ends the episode, and with it all rewards. A drone that could stay near the
     goal for ever would earn at most 1.25 + 0.99 * 1.25 + ... = 1.25 / (1 - 0.99) = 125. If arrival
     were worth less, staying away from it would be better. So arrival earns what staying would:
@@ -112,9 +113,7 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     arrival. So look at the share that arrived too, and not only at the share that crossed.
 
     On purpose, these parts change which way of flying is best. Potential-based shaping would not
-    [Ng 1999]: it pays gamma * P(s2) - P(s), for a function P of the state. With P = 2x, half a
-    metre forward would be worth 0.99 * 101 - 100 = -0.01 at x = 50, and 0.99 at x = 0, where ours
-    pays 1.0 everywhere. Every return that is printed or logged is the paper's.
+    [Ng 1999]. Every return that is printed or logged is the paper's.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -125,9 +124,9 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
 
 # -------------------------------------------------- train: what stands around the loop of dqn.py
 
-HEAD = "     step  eps   /s  left  return | return longer  cross  crash"
+HEAD = "     step  eps   /s  left  return | return length  cross  crash"
 ROW = "{step:9,} {epsilon:4.2f} {speed:4.0f} {left:4.0f}m {train_return:7.1f} |"
-ROW += "{validation_return:7.1f} {validation_longer:6.0%} {validation_crossed:6.0%}"
+ROW += "{validation_return:7.1f} {validation_steps:6.0f} {validation_crossed:6.0%}"
 ROW += " {validation_crash:6.0%}"
 
 
@@ -142,8 +141,6 @@ class Run:
         self.rng, self.forests = np.random.default_rng(c.seed), np.random.default_rng([c.seed, 1])
         seeds = (int(self.forests.integers(TRAIN_END)) for _ in count())
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
-        baseline = fly_random(VALIDATION, self.envs.world)
-        self.random_steps = float(measure(baseline)["steps"].mean())
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)
         self.agent, self.replay = next(self.loop)
         if saved:
@@ -172,16 +169,18 @@ class Run:
     def validate(self, seconds: float) -> None:
         """Fly the validation forests without exploring, and add a row to the log. best.pt keeps the
         weights of the best score: the share that crossed (with the beacon: arrived), then the
-        progress. In the last tenth of the steps (swa_fraction) it keeps the mean of the weights
-        instead, whatever its score, because the best of many scores is partly luck."""
+        progress. In the last tenth (swa_fraction) it keeps the mean of the weights, whatever its
+        score, because the best of many scores is partly luck."""
         envs, averaged = self.envs, self.agent.mean.n_averaged > 0
-        q = self.agent.mean.module if averaged else self.agent.q
-        q = copy.deepcopy(q).half().float()  # best.pt keeps half precision: fly that
-        recent = envs.episodes[-100:] or [drone.episode() for drone in envs.drones]
-        flown = {"train": recent, "validation": fly(dqn_pilot(q), VALIDATION, envs.world)}
+        q = copy.deepcopy(self.agent.mean.module if averaged else self.agent.q)
+        q.half().float()  # best.pt keeps half precision: fly that
+        recent = measure(envs.episodes[-100:] or [drone.episode() for drone in envs.drones])
+        flown = measure(fly(dqn_pilot(q), VALIDATION, envs.world))
         row = {"step": envs.steps, "episodes": len(envs.episodes), "epsilon": self.agent.epsilon}
-        row |= {f"{w}_{k}": float(x.mean()) for w in flown for k, x in measure(flown[w]).items()}
-        row["validation_longer"] = row["validation_steps"] / self.random_steps - 1
+        row |= {f"train_{key}": float(x.mean()) for key, x in recent.items()}
+        row |= {f"validation_{key}": float(x.mean()) for key, x in flown.items()}
+        last = self.log[-1] if self.log else {"step": 0, "seconds": 0.0}
+        speed = (envs.steps - last["step"]) / (seconds - last["seconds"])  # steps a second
         self.log.append(row | {"seconds": seconds})
         share = "validation_goal" if self.c.beacon else "validation_crossed"
         scores = [(row[share], row["validation_progress"]) for row in self.log]
@@ -191,8 +190,8 @@ class Run:
         text = "".join(",".join(map(str, line)) + "\n" for line in lines)
         atomic_write(self.folder / "log.csv", text.encode())
         self.save()
-        left, speed = (self.c.steps / envs.steps - 1) * seconds / 60, envs.steps / seconds
-        print(ROW.format(**self.log[-1], left=left, speed=speed), flush=True)
+        left = (self.c.steps - envs.steps) / speed / 60  # min
+        print(ROW.format(**row, speed=speed, left=left), flush=True)
 
     def save(self) -> None:
         """Write the checkpoint, 34 MB. Of the replay it holds the actions, one byte each."""

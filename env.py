@@ -22,16 +22,16 @@ a new frame from its camera. Each step earns a reward, which says how good the s
     | within 3 m of the goal, or too late  | as in the air                                       |
 
     r_safe = 0.25    r_crash = -10    r_goal = 1 - d_goal / d_max, 0 at the start and 1 at the goal
-    r_near falls in a straight line from 0 at d_neg = 2.0 m to r_precrash = -5 at d_crash = 0.75 m
+    r_near = -5 * (2.0 - d_obs) / (2.0 - 0.75), 0 at d_neg = 2.0 m and -5 at d_crash = 0.75 m
 
 One step in numbers: the drone is at x = 30 on the middle line, so d_goal = 60, and the nearest
-trunk is 1.5 m away. That is too close: -5 * (2.0 - 1.5) / (2.0 - 0.75) = -2. A third of the way is
-made: 1 - 60 / 90 = 0.33. The reward of the step is -1.67.
+trunk is 1.5 m away: r_near = -5 * 0.5 / 1.25 = -2. A third of the way is made: r_goal = 1 - 60 / 90
+= 0.33. The reward of the step is -1.67.
 
 One flight from the start to its end is an **episode**. It is **terminated** when the world ends it:
 by a crash, at the goal, or outside the forest. No more reward can follow. It is **truncated** when
 only the clock ends it, after 1,000 steps: the drone was still flying, and more reward would have
-followed. A learner must keep the two apart, or it learns that nothing follows a late moment.
+followed. A learner must keep the two apart, or it takes the clock for a crash.
 
 The drone sees its last four frames, an **observation**. That is less than the whole state of the
 world: the frames do not show which edge of the forest is the far one, or what stands behind the
@@ -124,14 +124,15 @@ def plant(seed: int, world: World) -> ndarray:
 class Drone:
     """A drone, and a new forest for it every episode. It does not see: VecForest draws its frames.
 
-    An action is a whole number: 0 turns right at 0.7 rad/s, 4 flies straight, 8 turns left.
+    An action is a whole number: 0 turns right at 0.7 rad/s, 4 flies straight, 8 turns left. While
+    an episode is active its outcome is "".
 
     A pymunk space holds shapes, here the trunks, and moves bodies, here the drone. A kinematic body
     goes where its velocity says, and nothing pushes it.
     """
 
     def __init__(self, world: World) -> None:
-        self.world, self.outcome = world, "not reset"  # counts as an episode that has ended
+        self.world, self.outcome = world, "not reset"  # so no episode is active
         self.space, self.body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         ground, trunks = self.space.static_body, math.prod(world.grid)
         self.shapes = [pymunk.Circle(ground, world.trunk_radius) for _ in range(trunks)]
@@ -144,7 +145,8 @@ class Drone:
             shape.unsafe_set_offset(centre)  # moves a trunk: ten times as quick as a new one
         self.space.reindex_static()  # tells pymunk that they moved
         self.body.position, self.body.angle, self.pose = (0.0, 0.0), 0.0, (0.0, 0.0, 0.0)
-        self.actions, self.progress, self.total, self.outcome = [], 0.0, 0.0, ""
+        self.actions, self.outcome = [], ""
+        self.progress = self.total = 0.0
         self.sense()
 
     def step(self, action: int) -> float:
@@ -180,10 +182,12 @@ class Drone:
     def judge(self) -> str:
         """How the episode has ended: one of OUTCOMES, tested in their order, or "" in the air."""
         (x, y, _), world = self.pose, self.world
-        near, late = self.d_goal < world.goal_radius, len(self.actions) >= world.max_steps
-        ended = (self.d_obs < world.d_crash, near, x > world.length, x < -world.back,
-                 abs(y) > world.width / 2, late)  # fmt: skip
-        return OUTCOMES[ended.index(True)] if any(ended) else ""
+        ended = {
+            "crash": self.d_obs < world.d_crash, "goal": self.d_goal < world.goal_radius,
+            "far": x > world.length, "back": x < -world.back, "side": abs(y) > world.width / 2,
+            "time": len(self.actions) >= world.max_steps,
+        }  # fmt: skip
+        return next((outcome for outcome in OUTCOMES if ended[outcome]), "")
 
     def episode(self) -> Episode:
         """The episode so far: seed, actions as one digit each, and what came of them."""
@@ -207,7 +211,7 @@ class VecForest:
         self.world, self.num_actions, self.blind = world, world.num_actions, blind
         self.drones, self.seeds = [Drone(world) for _ in range(num_envs)], iter(seeds)
         self.episodes: list[Episode] = []  # all that have ended
-        self.history: list[bytes] = []  # all actions: one byte for each active drone
+        self.history: list[bytes] = []  # all actions; deepflight.Run can fly them again
         self.steps = 0  # control steps of all drones together
 
     @property
@@ -264,7 +268,8 @@ def straight_pilot(s: ndarray, envs: VecForest) -> list[int]:
 
 
 def fly(pilot: Pilot, seeds: Sequence[int], world: World, *, blind: bool = False) -> list[Episode]:
-    """Fly one episode per seed, up to 100 side by side; returns them sorted by seed."""
+    """Fly one episode per seed, up to 100 side by side; returns them sorted by seed, so that
+    pilots can be compared forest by forest."""
     envs = VecForest(world, min(len(seeds), 100), seeds, blind=blind)
     while len(s := envs.reset_done()):  # (E, 4, 84, 84)
         envs.step(pilot(s, envs))

@@ -26,7 +26,7 @@ from dqn import InputError
 ROOT = Path(__file__).parents[2]
 FREE = ("seed", "threads")  # settings that may differ
 PANELS = {  # column of log.csv -> title, factor
-    "validation_longer": ("episodes longer than random, %", 100),
+    "validation_steps": ("steps of an episode", 1),
     "validation_return": ("return by the paper's reward", 1),
     "validation_crossed": ("crossed, %", 100),
 }

@@ -161,8 +161,8 @@ def train(c: "DemoConfig", envs: VecForest, rng: Generator, shaped: Callable) ->
     yield agent, replay
     if not envs.steps:  # [!] a restored training has done this
         pretrain(agent, demo_replay, c, rng)  # [!]
-    # step: the number of control steps after this pass; a restored run begins at envs.steps > 0
-    for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):
+    while envs.steps < c.steps:
+        step = envs.steps + c.num_envs  # control steps, this pass included
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
         agent.optimizer.param_groups[0]["lr"] = lr
@@ -172,7 +172,8 @@ def train(c: "DemoConfig", envs: VecForest, rng: Generator, shaped: Callable) ->
         a = np.where(explore, random, greedy(agent.q, s))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
         replay.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11
-        for _ in range(due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0):
+        updates = due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0
+        for _ in range(updates):
             batch = sample(replay, demo_replay, c.demo_share, c, rng)  # 12 [!]
             batch = mirror(batch, envs.num_actions, rng) if c.mirror else batch  # [+mirror]
             learn(agent, batch, c)  # 13, 14 [!]

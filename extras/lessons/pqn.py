@@ -189,7 +189,8 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
     rollout = Rollout(c.rollout)  # [!]
     agent = Agent(c, envs.num_actions, rng)  # 2 [!]
     yield agent, rollout  # [!]
-    for step in range(envs.steps + c.num_envs, c.steps + c.num_envs, c.num_envs):
+    while envs.steps < c.steps:
+        step = envs.steps + c.num_envs  # control steps, this pass included
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
         lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
         agent.optimizer.param_groups[0]["lr"] = lr
