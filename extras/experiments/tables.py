@@ -34,7 +34,8 @@ LESSONS = {f"DQN, seed {seed}": (name, "dqn") for seed, name in enumerate(SEEDS)
     "32 demonstrations alone, seed 0": ("demonstrations-32", "demonstrations"),
     "32 demonstrations alone, seed 1": ("demonstrations-32-1", "demonstrations"),
     "imitation from disparity, seed 0": ("imitation-disparity", "imitation"),
-    "PQN, seed 0": ("pqn", "pqn"), "memory, seed 0": ("memory", "memory"),
+    "PQN, seed 0": ("pqn", "pqn"), "PQN, seed 1": ("pqn-1", "pqn"),
+    "PQN, seed 2": ("pqn-2", "pqn"), "memory, seed 0": ("memory", "memory"),
     "memory, seed 1": ("memory-1", "memory"), "the planner": ("imitation", "laser"),
 }  # fmt: skip
 

@@ -11,23 +11,24 @@ import dqn
 
 
 def recipe(name: str, config: type, **changes: Any) -> type:
-    """A configuration like another, but for the defaults of some settings, for settings of its own,
-    which dqn.setting makes, and for class variables.
+    """A configuration like `config`. A change is another default of a setting, a setting of its
+    own, which dqn.setting makes, or else a class variable.
 
     >>> loud = dqn.setting(False, "say more", 0, 1)
     >>> Short = recipe("Short", deepflight.Config, steps=1_000, loud=loud, pilot="short")
     >>> Short().steps, Short(steps=2_000).steps, Short().gamma, Short().loud, Short.pilot
     (1000, 2000, 0.99, False, 'short')
     """
-    settings = []
-    for f in fields(config):
-        if f.name in changes:
-            default = field(default=changes.pop(f.name), metadata=f.metadata)
-            settings.append((f.name, f.type, default))
-    for key in [key for key, value in changes.items() if isinstance(value, Field)]:
-        own = changes.pop(key)
-        settings.append((key, type(own.default), own))
-    return make_dataclass(name, settings, bases=(config,), namespace=changes, frozen=True)
+    known, settings, variables = {f.name: f for f in fields(config)}, [], {}
+    for key, value in changes.items():
+        if key in known:
+            default = field(default=value, metadata=known[key].metadata)
+            settings.append((key, known[key].type, default))
+        elif isinstance(value, Field):
+            settings.append((key, type(value.default), value))
+        else:
+            variables[key] = value
+    return make_dataclass(name, settings, bases=(config,), namespace=variables, frozen=True)
 
 
 def run(config: type, argv: Sequence[str]) -> int:

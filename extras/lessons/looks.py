@@ -7,8 +7,8 @@
     python -m extras.lessons.looks eval --weights runs/looks-disparity/best.pt
     python -m extras.lessons.looks fly        four pilots in every look: results/transfer.json
 
-A training takes about a quarter of an hour, and `fly` half an hour. figures/transfer.png, which
-extras/experiments/figures.py draws, shows what the network sees in each look.
+A training takes about an hour, and `fly` half an hour. `eval` flies in the plain look.
+figures/transfer.png, which extras/experiments/figures.py draws, shows all looks.
 
 A network that learns from frames learns everything that helps, and so also what is true only in its
 training: that bark is darker than the sky, say. In another forest this misleads it, although no
@@ -31,8 +31,8 @@ pixels wide, whose lenses stand 12 cm apart. Its focal length is 320 pixels, so 
 
 **Domain randomization** lets what must not matter vary in the training, so that nothing can be
 learnt from it [Tobin 2017]. Each forest gets a look at random, from ranges that hold all looks in
-which we test. (Only haze is left out for disparity.) A look is a function of forest and pose alone,
-its noise included. So an episode is still determined by its seed and its actions, and an
+which we test. (For disparity haze does not vary.) The forest determines the look, and forest and
+pose determine the noise. So an episode is still determined by its seed and its actions, and an
 interrupted training can go on.
 
 What differs from expert.py
@@ -41,11 +41,11 @@ The network, the loss, the planner and the loop are the same.
 
 What came out, in 200 forests (results/transfer.json)
     * The grey pilot crosses 87 % in the world of its training, and 0 % where bark is bright or
-      striped, or at dusk. With random looks it crosses 70 to 83 % in each look, and 77 % where the
-      other one crosses 87 %.
+      striped, or at dusk. Trained with random looks it crosses 70 to 83 % in every look, and 77 %
+      in the plain world.
     * The disparity pilot crosses 86.5 %, whatever the paint and the light. With all errors of a
-      stereo camera together it crosses 66.5 %, and 86 % if it was trained with random errors. So a
-      real drone should fly that one.
+      stereo camera together it crosses 66.5 %, and 86 % if it was trained with random errors.
+      So of these a real drone should get that one.
 
 Legend
     E     drones that look at the same time
@@ -97,7 +97,7 @@ class Look:
 
 
 PLAIN, NO_HAZE, THICK_HAZE = Look(), Look({"view": 1000.0}), Look({"view": 15.0})
-LOOKS = {  # camera -> name -> look. Of those of a grey camera, disparity notices haze alone.
+LOOKS = {  # camera -> name -> look. Of the grey camera's looks, disparity notices only haze.
     "grey": {
         "plain": PLAIN,
         "bright bark": Look({"trunk_facing": 220, "trunk_grazing": 150}),
@@ -136,6 +136,7 @@ def wear(look: Look, poses: ndarray, trunks: Trunks, scene: Scene, *beacon: Any)
     change = mismatch if scene.camera == "disparity" else expose
     changed = []
     for frame, pose, forest in zip(frames, poses, trunks, strict=True):
+        # Seeded by the bits of these numbers: as whole numbers, without the sign of zero.
         rng = np.random.default_rng(np.abs([*pose, *forest[0]]).view(np.uint32))
         changed.append(change(frame.astype(float), look, scene, rng))
     return np.clip(np.rint(changed), 0, 255).astype(np.uint8)  # (E, 84, 84)
@@ -162,7 +163,7 @@ def expose(frame: ndarray, look: Look, _scene: Scene, rng: Generator) -> ndarray
 
 def mismatch(frame: ndarray, look: Look, scene: Scene, rng: Generator) -> ndarray:
     """What a stereo camera gets wrong in a frame of disparity (84, 84)."""
-    if look.fat:  # the nearer side of an edge grows
+    if look.fat:  # a pixel shows the nearest of those from 2 * fat on its right to fat on its left
         padded = np.pad(frame, ((0, 0), (look.fat, 2 * look.fat)))
         shifted = [padded[:, i : i + PIXELS] for i in range(3 * look.fat + 1)]
         frame = np.maximum.reduce(shifted)  # (84, 84)
@@ -171,7 +172,7 @@ def mismatch(frame: ndarray, look: Look, scene: Scene, rng: Generator) -> ndarra
         inside = trunk & np.roll(trunk, 1, 1) & np.roll(trunk, -1, 1)  # (84, 84) not the two edges
         blocks = rng.random((21, 21)) < look.holes
         hole = inside & np.kron(blocks, np.ones((4, 4), bool))  # (84, 84)
-        last = np.maximum.accumulate(np.where(hole, 0, np.arange(84)), 1)  # (84, 84) no hole
+        last = np.maximum.accumulate(np.where(hole, 0, np.arange(84)), 1)  # (84, 84) column
         filled = np.take_along_axis(frame, last, 1)  # (84, 84)
         frame = filled if look.filled else np.where(hole, 0, frame)
     frame = frame + look.error * rng.standard_normal(frame.shape, np.float32) * (frame > 0)
@@ -221,7 +222,7 @@ def wear_at_random(poses: ndarray, trunks: Trunks, scene: Scene, *beacon: Any) -
 def train(
     c: deepflight.Config, envs: env.VecForest, rng: Generator, shaped: Callable
 ) -> Iterator[tuple]:
-    """The loop of expert.py, and validation beside it, in forests with looks of their own."""
+    """The loop of expert.py. While it runs, all drones see random looks, in validation too."""
     with seeing(wear_at_random):
         yield from ExpertConfig.train(c, envs, rng, shaped)
 
