@@ -190,7 +190,7 @@ class Run:
         text = "".join(",".join(map(str, line)) + "\n" for line in lines)
         atomic_write(self.folder / "log.csv", text.encode())
         self.save()
-        left = (self.c.steps - envs.steps) / speed / 60  # min
+        left = max(self.c.steps - envs.steps, 0) / speed / 60  # min
         print(ROW.format(**row, speed=speed, left=left), flush=True)
 
     def save(self) -> None:
