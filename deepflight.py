@@ -43,8 +43,6 @@ import argparse
 import copy
 import io
 import json
-import math
-import os
 import signal
 import sys
 import time
@@ -151,11 +149,11 @@ class Run:
         envs, c = self.envs, self.c
         began = time.perf_counter() - (self.log[-1]["seconds"] if self.log else 0)
         self.folder.mkdir(parents=True, exist_ok=True)
-        atomic_write(self.folder / "config.json", json.dumps(asdict(c), indent=2).encode())
+        save(self.folder / "config.json", json.dumps(asdict(c), indent=2).encode())
         with stop_signals() as stopped:
             print(f"{self.folder}: {c.steps:,} steps, {c.num_envs} at a time\n\n{HEAD}", flush=True)
             for _ in self.loop:
-                if not math.isfinite(self.agent.loss):
+                if not np.isfinite(self.agent.loss):
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")
                 if dqn.due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
                     self.validate(time.perf_counter() - began)
@@ -186,21 +184,19 @@ class Run:
         scores = [(row[share], row["validation_progress"]) for row in self.log]
         if averaged or scores[-1] > max(scores[:-1], default=(-1, 0)):
             save_weights(self.folder / "best.pt", q, self.c)
-        lines = [self.log[0].keys(), *(row.values() for row in self.log)]
+        lines = [self.log[0], *(row.values() for row in self.log)]  # at first the names
         text = "".join(",".join(map(str, line)) + "\n" for line in lines)
-        atomic_write(self.folder / "log.csv", text.encode())
+        save(self.folder / "log.csv", text.encode())
         self.save()
         left = max(self.c.steps - envs.steps, 0) / speed / 60  # min
         print(ROW.format(**row, speed=speed, left=left), flush=True)
 
     def save(self) -> None:
         """Write the checkpoint, 34 MB. Of the replay it holds the actions, one byte each."""
-        content = {
-            "config": asdict(self.c), "kind": kind(self.c), "log": self.log,
-            "actions": self.envs.history, "forests": self.forests.bit_generator.state,
-            "agent": self.agent.state_dict(), "optimizer": self.agent.optimizer.state_dict(),
-            "rng": self.rng.bit_generator.state,
-        }  # fmt: skip
+        content = {"config": asdict(self.c), "kind": kind(self.c), "log": self.log,
+                   "actions": self.envs.history, "forests": self.forests.bit_generator.state,
+                   "rng": self.rng.bit_generator.state, "agent": self.agent.state_dict(),
+                   "optimizer": self.agent.optimizer.state_dict()}  # fmt: skip
         save(self.folder / "checkpoint.pt", content)
 
     def restore(self, saved: dict[str, Any]) -> None:
@@ -223,19 +219,19 @@ class Run:
 
 def dqn_pilot(q: QNetwork) -> Pilot:
     """The pilot that takes the action of greatest value: four frames and nothing else."""
-    return lambda s, envs: dqn.greedy(q, s, *q.senses(envs.active))
+    return lambda s, envs: q.values(s, envs.active).argmax(1)
 
 
 def fly_random(seeds: Sequence[int], world: World) -> list[Episode]:
     """The baseline: 2,000 random episodes or more, equally many in each forest, because they vary
     so much in length."""
-    pilot, repeats = env.random_pilot(np.random.default_rng(0)), math.ceil(2000 / len(seeds))
-    return [e for _ in range(repeats) for e in fly(pilot, seeds, world, blind=True)]
+    pilot, repeats = env.random_pilot(np.random.default_rng(0)), -(-2000 // len(seeds))
+    return [episode for _ in range(repeats) for episode in fly(pilot, seeds, world)]
 
 
 def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
-    """Fly a network beside other pilots, which see nothing, through the same forests: a table,
-    JSON, and a film of the network's first episode that crossed (or of the first)."""
+    """Fly a network and other pilots through the same forests: a table, JSON, and a film of the
+    network's first episode that crossed (or of the first)."""
     q, world, name = load_weights(args.weights, config.network)
     seeds, film = range(args.first_seed, args.first_seed + args.episodes), args.out / "flight.gif"
     if not (0 < args.episodes <= 10**6 and args.first_seed >= 0 and 0 < args.threads <= 64):
@@ -247,17 +243,16 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
     print(f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n", flush=True)
     flown = {"random": fly_random(seeds, world)}
     for who, pilot in (config.baselines | {name: dqn_pilot(q)}).items():
-        flown[who] = fly(pilot, seeds, world, blind=who != name)
-    draws = np.random.default_rng(0).integers(len(seeds), size=(2000, len(seeds)))
-    metrics = {who: summarize(flown[who], flown["random"], draws) for who in flown}
+        flown[who] = fly(pilot, seeds, world)
+    metrics = {who: summarize(flown[who], flown["random"], len(seeds)) for who in flown}
     print_table(metrics)
     if args.json:
         report = {"weights": args.weights.name, "beacon": world.beacon, "camera": world.camera}
         report |= {"forests": len(seeds), "first_seed": seeds[0]}
         report["pilots"] = {who: metrics[who] | {"episodes": flown[who]} for who in flown}
-        atomic_write(args.json, json.dumps(report).encode())
-    shown = flown[name][measure(flown[name])["crossed"].argmax()]
-    render.save_film(film, draw_film(shown, world, q, name), round(1000 * world.dt))
+        save(args.json, json.dumps(report).encode())
+    shown = flown[name][measure(flown[name])["crossed"].argmax()]  # the first True, or the first
+    save_film(film, shown, world, q, name)
     print(f"\nwrote {film}: forest {shown['seed']}")
     return 0
 
@@ -271,19 +266,18 @@ def measure(episodes: list[Episode]) -> dict[str, ndarray]:
     Crossed means arrived at the goal, or left by the far edge.
     """
     table = {key: np.array([e[key] for e in episodes]) for key in ("steps", "progress", "return")}
-    outcome = np.array([episode["outcome"] for episode in episodes])  # (F,)
-    table["crossed"] = np.isin(outcome, ("goal", "far"))
-    return table | {name: outcome == name for name in env.OUTCOMES}
+    ended = {key: np.array([e["outcome"] == key for e in episodes]) for key in env.OUTCOMES}
+    return table | {"crossed": ended["goal"] | ended["far"]} | ended
 
 
-def summarize(episodes: list[Episode], baseline: list[Episode], draws: ndarray) -> dict[str, dict]:
-    """Every metric with its 95 % interval.
+def summarize(episodes: list[Episode], baseline: list[Episode], forests: int) -> dict[str, dict]:
+    """Every metric with its 95 % interval. Episodes are in the order of `fly`, once or repeatedly.
 
     Episodes in the same forest resemble each other, so means are taken over forests. Their interval
     comes from the bootstrap: draw as many forests again, with replacement, 2,000 times, and see how
-    the mean varies. draws (2000, forests): the bootstrap indices. A share has Wilson's interval.
+    the mean varies. A share has Wilson's interval.
     """
-    forests = draws.shape[1]
+    draws = np.random.default_rng(0).integers(forests, size=(2000, forests))
     means = {key: x.reshape(-1, forests).mean(0) for key, x in measure(episodes).items()}
     random = measure(baseline)["steps"].reshape(-1, forests).mean(0)  # (forests,)
     ratios = means["steps"][draws].mean(1) / random[draws].mean(1)  # (2000,) the same forests
@@ -300,15 +294,14 @@ def interval(value: float, resampled: ndarray) -> dict[str, float]:
     return {"value": float(value), "low": float(low), "high": float(high)}
 
 
-def wilson(p: float, n: int) -> dict[str, float]:
+def wilson(p: float, n: int, z: float = 1.96) -> dict[str, float]:
     """A share p of n, and its 95 % interval by Wilson's score [Wilson 1927].
 
     >>> {key: round(x, 3) for key, x in wilson(1.0, 10).items()}
     {'value': 1.0, 'low': 0.722, 'high': 1.0}
     """
-    z = 1.96
     middle = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    half = z / (1 + z * z / n) * (p * (1 - p) / n + z * z / (4 * n * n)) ** 0.5
     return {"value": float(p), "low": max(middle - half, 0.0), "high": min(middle + half, 1.0)}
 
 
@@ -325,36 +318,34 @@ def print_table(metrics: dict[str, dict]) -> None:
         print(f"{label:14}" + "".join(f"{f'{x} [{low}, {high}]':>17}" for x, low, high in cells))
 
 
-@torch.no_grad()
-def draw_film(episode: Episode, world: World, q: QNetwork, name: str) -> Iterator[Any]:
-    """The pictures of an episode: frame, path, and what the network says of each action."""
-    path = []
-    for t, (s, drone) in enumerate(env.refly(episode, world)):
-        path.append(drone.pose[:2])
-        values = q(torch.from_numpy(s)[None], *q.senses([drone]))[0].numpy()  # (A,)
+def save_film(path: Path, episode: Episode, world: World, q: QNetwork, name: str) -> None:
+    """Write an endless GIF of an episode: frame, path, and what the network says of each action."""
+    places, pictures = [], []
+    for t, drone in enumerate(env.refly(episode, world)):
+        places.append(drone.pose[:2])
+        values = q.values(drone.observation[None], [drone])[0]  # (A,)
         text = f"{name}: {t * world.dt:.1f} s, {drone.d_goal:.1f} m to the goal\n"
         text += f"reward so far {drone.total:.1f}   {drone.outcome}"
-        yield render.draw_panel(s[-1], drone.trunks, np.array(path), drone.outcome, values, text)
+        pictures.append(render.draw_panel(drone, np.array(places), values, text))
+    ms = round(1000 * world.dt)
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=ms, loop=0)
 
 
 # -------------------------------------------------- files, signals: skip on a first reading
 
 
-def atomic_write(path: Path, data: bytes) -> None:
-    """Write a file that stands under its name only when it is whole."""
-    part = path.with_name(f".{path.name}.{os.getpid()}")
+def save(path: Path, content: bytes | dict[str, Any]) -> None:
+    """Write bytes, or tensors and plain values. The file stands under its name only when whole."""
+    part = path.with_name(f".{path.name}.part")
+    if isinstance(content, dict):
+        buffer = io.BytesIO()  # torch.save to a full disk would not say so
+        torch.save(content, buffer)
+        content = buffer.getvalue()
     try:
-        part.write_bytes(data)
+        part.write_bytes(content)
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
-
-
-def save(path: Path, content: dict[str, Any]) -> None:
-    """Write tensors and plain values."""
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    atomic_write(path, buffer.getvalue())
 
 
 def load(path: Path | str, *keys: str) -> dict[str, Any]:

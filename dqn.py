@@ -155,16 +155,11 @@ class QNetwork(nn.Module):
             features = self.conv(grey)  # (B, 3136)
         return self.head(features.float())  # (B, A)
 
-    def senses(self, drones: Any) -> tuple:
-        """What these drones tell the network beside frames: nothing here."""
-        return ()
-
-
-@torch.no_grad()
-def greedy(q: QNetwork, s: ndarray, *senses: Tensor) -> ndarray:
-    """The actions (B,) of greatest value for the observations s (B, 4, 84, 84) uint8, and for what
-    else the network is told (nothing, but in a lesson)."""
-    return q(torch.from_numpy(s), *senses).argmax(1).numpy()
+    @torch.no_grad()
+    def values(self, s: ndarray, drones: Any) -> ndarray:
+        """Q(s, .) (E, A) of s (E, 4, 84, 84) uint8, for acting. drones: whose observations these
+        are; a lesson's network asks them for more."""
+        return self(torch.from_numpy(s)).numpy()
 
 
 class Batch(NamedTuple):
@@ -203,18 +198,15 @@ class Replay:
     """
 
     def __init__(self, capacity: int, num_envs: int) -> None:
-        self.rows, self.num_envs = capacity // num_envs, num_envs  # T, L
-        self.frames = np.empty((self.rows, num_envs, 84, 84), np.uint8)  # (T, L, 84, 84)
-        self.actions = np.zeros((self.rows, num_envs), np.int64)  # (T, L)
-        self.rewards = np.zeros((self.rows, num_envs), np.float32)  # (T, L)
-        self.ends = np.zeros((self.rows, num_envs), np.uint8)  # (T, L)
+        shape = self.rows, self.num_envs = capacity // num_envs, num_envs  # T, L
+        self.frames = np.empty((*shape, 84, 84), np.uint8)  # (T, L, 84, 84)
+        self.actions, self.ends = np.zeros(shape, np.int64), np.zeros(shape, np.uint8)  # (T, L)
+        self.rewards = np.zeros(shape, np.float32)  # (T, L)
         self.last_frames: dict[tuple[int, int], ndarray] = {}  # (row, env) -> (84, 84)
         self.added = 0  # rows ever written
 
-    def add(
-        self, s: ndarray, a: ndarray, r: ndarray, s2: ndarray,
-        terminated: ndarray, truncated: ndarray,
-    ) -> None:  # fmt: skip
+    def add(self, s: ndarray, a: ndarray, r: ndarray, s2: ndarray,
+            terminated: ndarray, truncated: ndarray) -> None:  # fmt: skip
         """Write one transition per environment: s, s2 (L, 4, 84, 84), all others (L,).
 
         The next row holds the newest frame of s2. If the time limit ends an episode, the next row
@@ -412,7 +404,7 @@ def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator
         s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
         random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
-        a = np.where(explore, random, greedy(agent.q, s))  # 8 (L,)
+        a = np.where(explore, random, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
         replay.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11
         updates = due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0

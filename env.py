@@ -56,24 +56,22 @@ Not in this file: rotors, wind, inertia, a change of altitude.
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pymunk
 from numpy import ndarray
 
-from render import PIXELS, Scene, draw_frames
+from render import Scene, draw_frame
 
 STACK = 4  # frames in an observation [DF §II-A]
 OUTCOMES = ("crash", "goal", "far", "back", "side", "time")  # how an episode may end
-Episode = dict[str, Any]  # what Drone.episode returns
+Episode = dict  # what Drone.episode returns
 
 
 @dataclass(frozen=True)
 class World(Scene):
-    """The forest, the drone and the rules, in SI units; from `Scene`, what they look like."""
+    """The forest, the drone and the rules, in SI units. `Scene` adds the length and all looks."""
 
-    length: float = 90.0  # m, x of the far edge; d_max of the reward [DF §II-A]
     width: float = 50.0  # m; this and all down to jitter: authors' simulator
     back: float = 2.0  # m, how far the drone may retreat behind the start
     grid: tuple[int, int] = (15, 10)  # trunks along x and along y
@@ -92,7 +90,6 @@ class World(Scene):
     r_crash: float = -10.0
     goal_radius: float = 3.0  # m: ours
     max_steps: int = 1000  # then the episode is truncated, authors' evaluation
-    beacon: bool = False  # a pole that makes the goal visible; off in the paper's world
 
 
 def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
@@ -122,10 +119,11 @@ def plant(seed: int, world: World) -> ndarray:
 
 
 class Drone:
-    """A drone, and a new forest for it every episode. It does not see: VecForest draws its frames.
+    """A drone, and a new forest for it every episode.
 
-    An action is a whole number: 0 turns right at 0.7 rad/s, 4 flies straight, 8 turns left. While
-    an episode is active its outcome is "".
+    An action is a whole number: 0 turns right at 0.7 rad/s, 4 flies straight, 8 turns left. An
+    observation is (4, 84, 84) uint8, oldest frame first; at the start of an episode its first frame
+    is repeated four times. While an episode is active its outcome is "".
 
     A pymunk space holds shapes, here the trunks, and moves bodies, here the drone. A kinematic body
     goes where its velocity says, and nothing pushes it.
@@ -171,44 +169,41 @@ class Drone:
 
     def sense(self) -> None:
         """Measure where the drone is (pose: x, y in m and heading in rad), how much x it gained in
-        this step (forward, m), its largest x so far (progress, m), d_obs and d_goal."""
+        this step (forward, m), its largest x so far (progress, m), d_obs and d_goal; then look."""
         (x, y), x_before = self.body.position, self.pose[0]
         self.pose = (x, y, self.body.angle)
         self.forward, self.progress = x - x_before, max(self.progress, x)
         trunk = self.space.point_query_nearest((x, y), self.world.laser_range, pymunk.ShapeFilter())
         self.d_obs = trunk.distance if trunk else self.world.laser_range  # None: out of reach
         self.d_goal = math.dist((x, y), (self.world.length, 0))
+        frame = draw_frame(self.pose, self.trunks, self.world)  # (84, 84)
+        before = self.observation[1:] if self.actions else [frame] * (STACK - 1)
+        self.observation = np.stack([*before, frame])  # (4, 84, 84)
 
     def judge(self) -> str:
         """How the episode has ended: one of OUTCOMES, tested in their order, or "" in the air."""
         (x, y, _), world = self.pose, self.world
-        ended = {
-            "crash": self.d_obs < world.d_crash, "goal": self.d_goal < world.goal_radius,
-            "far": x > world.length, "back": x < -world.back, "side": abs(y) > world.width / 2,
-            "time": len(self.actions) >= world.max_steps,
-        }  # fmt: skip
+        ended = {"crash": self.d_obs < world.d_crash, "goal": self.d_goal < world.goal_radius,
+                 "far": x > world.length, "back": x < -world.back, "side": abs(y) > world.width / 2,
+                 "time": len(self.actions) >= world.max_steps}  # fmt: skip
         return next((outcome for outcome in OUTCOMES if ended[outcome]), "")
 
     def episode(self) -> Episode:
         """The episode so far: seed, actions as one digit each, and what came of them."""
-        return {
-            "seed": self.seed, "actions": "".join(map(str, self.actions)), "outcome": self.outcome,
-            "steps": len(self.actions), "progress": self.progress, "return": self.total,
-        }  # fmt: skip
+        return {"seed": self.seed, "actions": "".join(map(str, self.actions)),
+                "outcome": self.outcome, "steps": len(self.actions), "progress": self.progress,
+                "return": self.total}  # fmt: skip
 
 
 class VecForest:
     """A vector environment: drones side by side, each in a forest of its own.
 
-    An observation is (4, 84, 84) uint8, oldest frame first; at the start of an episode its first
-    frame is repeated four times. One call of the camera draws for all drones, and one pass through
-    a network can pick all actions. seeds: of the forests to fly through. When they run out, a drone
-    stays inactive after its last episode. With `blind=True` all frames are black, for pilots that
-    do not look.
+    One pass through a network can pick the actions of all. seeds: of the forests to fly through.
+    When they run out, a drone stays inactive after its last episode.
     """
 
-    def __init__(self, world: World, num_envs: int, seeds: Iterable, blind: bool = False) -> None:
-        self.world, self.num_actions, self.blind = world, world.num_actions, blind
+    def __init__(self, world: World, num_envs: int, seeds: Iterable) -> None:
+        self.world, self.num_actions = world, world.num_actions
         self.drones, self.seeds = [Drone(world) for _ in range(num_envs)], iter(seeds)
         self.episodes: list[Episode] = []  # all that have ended
         self.history: list[bytes] = []  # all actions; deepflight.Run can fly them again
@@ -224,9 +219,6 @@ class VecForest:
         for drone in self.drones:
             if drone.outcome and (seed := next(self.seeds, None)) is not None:
                 drone.reset(seed)
-        begun = [drone for drone in self.active if not drone.actions]
-        for drone, frame in zip(begun, self.look(begun), strict=True):
-            drone.observation = np.repeat(frame[None], STACK, 0)  # (4, 84, 84)
         return np.array([drone.observation for drone in self.active])  # (E, 4, 84, 84)
 
     def step(self, actions: Iterable[int]) -> tuple:
@@ -236,22 +228,12 @@ class VecForest:
         """
         drones = self.active
         r = np.array([drone.step(a) for drone, a in zip(drones, actions, strict=True)])  # (E,)
-        for drone, frame in zip(drones, self.look(drones), strict=True):
-            drone.observation = np.concatenate([drone.observation[1:], frame[None]])
         s2 = np.array([drone.observation for drone in drones])  # (E, 4, 84, 84)
         self.history.append(bytes(drone.actions[-1] for drone in drones))
         self.steps += len(drones)
         self.episodes += [drone.episode() for drone in drones if drone.outcome]
         outcomes = np.array([drone.outcome for drone in drones])  # (E,)
         return s2, r, ~np.isin(outcomes, ("", "time")), outcomes == "time", drones
-
-    def look(self, drones: Sequence[Drone]) -> ndarray:
-        """What these E drones see: frames (E, 84, 84) uint8."""
-        if self.blind or not drones:
-            return np.zeros((len(drones), PIXELS, PIXELS), np.uint8)
-        poses = np.array([drone.pose for drone in drones])  # (E, 3)
-        goal = (self.world.length, 0) if self.world.beacon else None
-        return draw_frames(poses, [drone.trunks for drone in drones], self.world, goal)
 
 
 Pilot = Callable[[ndarray, VecForest], Sequence[int]]  # observations (E, 4, 84, 84) -> actions (E,)
@@ -267,18 +249,20 @@ def straight_pilot(s: ndarray, envs: VecForest) -> list[int]:
     return [envs.num_actions // 2] * len(s)
 
 
-def fly(pilot: Pilot, seeds: Sequence[int], world: World, *, blind: bool = False) -> list[Episode]:
+def fly(pilot: Pilot, seeds: Sequence[int], world: World) -> list[Episode]:
     """Fly one episode per seed, up to 100 side by side; returns them sorted by seed, so that
     pilots can be compared forest by forest."""
-    envs = VecForest(world, min(len(seeds), 100), seeds, blind=blind)
+    envs = VecForest(world, min(len(seeds), 100), seeds)
     while len(s := envs.reset_done()):  # (E, 4, 84, 84)
         envs.step(pilot(s, envs))
     return sorted(envs.episodes, key=lambda episode: episode["seed"])
 
 
-def refly(episode: Episode, world: World) -> Iterator[tuple[ndarray, Drone]]:
-    """Fly an episode again: yields the observation (4, 84, 84) and the drone, from the start on."""
-    envs = VecForest(world, 1, [episode["seed"]])
-    yield envs.reset_done()[0], envs.drones[0]
+def refly(episode: Episode, world: World) -> Iterator[Drone]:
+    """Fly an episode again: yields the drone at the start and after each step."""
+    drone = Drone(world)
+    drone.reset(episode["seed"])
+    yield drone
     for action in episode["actions"]:
-        yield envs.step([int(action)])[0][0], envs.drones[0]
+        drone.step(int(action))
+        yield drone

@@ -207,7 +207,7 @@ class Corridor:
     frames = np.zeros((6, 4, 84, 84), np.uint8)  # the cells between both ends
     for cell in range(4):
         frames[1 + cell, :, :, 21 * cell : 21 * cell + 21] = 255
-    num_actions = 2
+    num_actions, drones = 2, ()
 
     def __init__(self) -> None:
         self.rng, self.steps, self.cells = np.random.default_rng(1), 0, np.full(4, -1)
@@ -236,8 +236,8 @@ def test_dqn_solves_a_tiny_mdp() -> None:
     torch.set_num_threads(1)
     envs = Corridor()
     *_, (one, _) = dqn.train(WALK, envs, np.random.default_rng(0), lambda r, *_: r)
-    assert dqn.greedy(one.q, envs.frames[1:5]).tolist() == [1, 1, 1, 1]
-    best = one.q(torch.from_numpy(envs.frames[1:5])).max(1).values.tolist()
+    assert one.q.values(envs.frames[1:5], ()).argmax(1).tolist() == [1, 1, 1, 1]
+    best = one.q.values(envs.frames[1:5], ()).max(1).tolist()
     assert best == approx([0.9**3, 0.9**2, 0.9, 1.0], abs=0.1)
 
 
@@ -247,12 +247,15 @@ def test_the_loop_acts_greedily_syncs_the_target_network_and_averages_the_last_s
     loop = dqn.train(c, envs, np.random.default_rng(0), lambda r, *_: r)
     one, replay = next(loop)
     synced = one.q.head[2].weight.detach().clone()
-    choice, last = dqn.greedy(one.q, envs.frames[1:5]), []
+    choice, last = one.q.values(envs.frames[1:5], ()).argmax(1), []
     for step, _ in zip(range(4, 164, 4), loop, strict=True):
         assert (envs.taken == choice[envs.before]).all()
         assert (4 * replay.added, envs.steps, one.epsilon) == (step, step, 0.0)
         assert one.optimizer.param_groups[0]["lr"] == approx(1e-3 * (1 - 0.5 * step / 160))
-        q, choice = one.q.head[2].weight.detach().clone(), dqn.greedy(one.q, envs.frames[1:5])
+        q, choice = (
+            one.q.head[2].weight.detach().clone(),
+            one.q.values(envs.frames[1:5], ()).argmax(1),
+        )
         synced = q if step % 36 == 0 else synced
         assert torch.equal(one.q_target.head[2].weight, synced)
         last += [q] if step > 120 else []

@@ -24,8 +24,8 @@ def flown(world: World, actions: Sequence[int], seed: int = 0) -> Drone:
     return drone
 
 
-def begun(world: World, seeds: Sequence[int], blind: bool = False) -> VecForest:
-    envs = VecForest(world, len(seeds), seeds, blind=blind)
+def begun(world: World, seeds: Sequence[int]) -> VecForest:
+    envs = VecForest(world, len(seeds), seeds)
     envs.reset_done()
     return envs
 
@@ -96,7 +96,7 @@ ENDS = {
 
 @pytest.mark.parametrize("outcome", ENDS)
 def test_each_outcome_is_reached_and_only_time_truncates(outcome: str) -> None:
-    envs, actions = begun(WORLD if outcome == "crash" else CLEARING, [0], True), iter(ENDS[outcome])
+    envs, actions = begun(WORLD if outcome == "crash" else CLEARING, [0]), iter(ENDS[outcome])
     while envs.active:
         _, (r,), (terminated,), (truncated,), (drone,) = envs.step([next(actions)])
         assert not (envs.active and (terminated or truncated))
@@ -138,7 +138,7 @@ def test_drones_side_by_side_fly_as_each_would_alone(beacon: bool) -> None:
 
 
 def test_where_no_seed_is_left_a_drone_stays_inactive() -> None:
-    envs, passes = VecForest(WORLD, 3, iter([5, 6, 7, 8]), blind=True), []
+    envs, passes = VecForest(WORLD, 3, iter([5, 6, 7, 8])), []
     while len(s := envs.reset_done()):
         passes.append(len(s))
         envs.step([4] * len(s))
@@ -157,16 +157,16 @@ def test_an_episode_is_its_seed_and_its_actions() -> None:
             steps.append((envs.step([int(rng.integers(2, 7))])[0][0], envs.drones[0].pose))
         (episode,) = envs.episodes
         assert episode["steps"] == len(episode["actions"]) == len(steps) - 1
-        for (s, pose), (again, drone) in zip(steps, refly(episode, world), strict=True):
-            assert (s == again).all() and pose == drone.pose
+        for (s, pose), drone in zip(steps, refly(episode, world), strict=True):
+            assert (s == drone.observation).all() and pose == drone.pose
         assert drone.episode() == episode
 
 
 def test_fly_returns_one_episode_a_seed_in_their_order() -> None:
     seeds = [*range(130, 0, -1), 7, 7]  # more than fly at once, and one forest three times
-    episodes = fly(straight_pilot, seeds, WORLD, blind=True)
+    episodes = fly(straight_pilot, seeds, WORLD)
     assert [episode["seed"] for episode in episodes] == sorted(seeds)
     for episode in episodes[:20]:
         assert episode == flown(WORLD, [4] * 200, episode["seed"]).episode()
-    (episode,) = fly(straight_pilot, [0], CLEARING, blind=True)
+    (episode,) = fly(straight_pilot, [0], CLEARING)
     assert (episode["outcome"], episode["actions"]) == ("goal", "4" * 175)  # to x = 87.5 m
