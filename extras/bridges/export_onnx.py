@@ -40,7 +40,7 @@ import torch
 from numpy import ndarray
 
 from deepflight import VALIDATION, load_weights
-from dqn import QNetwork, greedy
+from dqn import QNetwork
 from env import VecForest, World
 from render import CAMERAS
 
@@ -81,14 +81,14 @@ def observations(q: QNetwork, world: World, size: int) -> ndarray:
     while len(seen) < size:
         s = envs.reset_done()  # (8, 4, 84, 84)
         seen += [*s]
-        envs.step(np.where(np.arange(8) % 2, rng.integers(world.num_actions, size=8), greedy(q, s)))
+        random, best = rng.integers(world.num_actions, size=8), q.values(s, ()).argmax(1)  # (8,)
+        envs.step(np.where(np.arange(8) % 2, random, best))
     return np.stack(seen[:size])
 
 
 def parity(q: QNetwork, run: onnxruntime.InferenceSession, s: ndarray) -> dict[str, float]:
     """Largest difference over an observation's largest value, and the share of equal actions."""
-    with torch.no_grad():
-        ours = q(torch.from_numpy(s)).numpy()  # (N, 9)
+    ours = q.values(s, ())  # (N, 9)
     theirs = run.run(None, {"observation": s})[0]  # (N, 9)
     error = np.abs(theirs - ours).max(1) / np.abs(ours).max(1)  # (N,)
     same = theirs.argmax(1) == ours.argmax(1)  # (N,)
@@ -125,7 +125,7 @@ def main() -> None:
     run, s = session(path), observations(q, world, SIZE)
     report = parity(q, run, s)
     report["onnxruntime, ms"] = latency(lambda one: run.run(None, {"observation": one}), s)
-    report["torch, ms"] = latency(lambda one: greedy(q, one), s)
+    report["torch, ms"] = latency(lambda one: q.values(one, ()), s)
     print(f"wrote {path}, {path.stat().st_size / 1e6:.1f} MB\n{json.dumps(report, indent=1)}")
 
 

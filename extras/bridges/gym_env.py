@@ -75,11 +75,9 @@ def begin(env: AnyEnv, drone: Drone, seed: int | None) -> None:
 
 
 def look(envs: VecForest) -> ndarray:
-    """Give every drone its next frame, by one camera call; observations (E, 4, 84, 84)."""
-    for drone, frame in zip(envs.drones, envs.look(envs.drones), strict=True):
-        begun = not drone.actions
-        drone.path = [*([] if begun else drone.path), drone.pose[:2]]
-        drone.observation = np.stack([*([frame] * 3 if begun else drone.observation[1:]), frame])
+    """All observations (E, 4, 84, 84); keeps the path of every drone."""
+    for drone in envs.drones:
+        drone.path = [*(drone.path if drone.actions else []), drone.pose[:2]]
     return np.stack([drone.observation for drone in envs.drones])
 
 

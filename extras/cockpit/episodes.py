@@ -16,6 +16,7 @@ Not in this file: HTTP, which is in __main__.py, and the rules of the world, whi
 import re
 from base64 import b64encode
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from deepflight import TRAIN_END, Config, load_weights
 from dqn import InputError, QNetwork
 from env import STACK, Pilot, VecForest, World, random_pilot, straight_pilot
 from extras.lessons.expert import laser_pilot
-from render import BEARINGS, draw_frames, seen_from
+from render import BEARINGS, draw_frame, seen_from
 
 ROOT = Path(__file__).parents[2]
 WORLDS = {"plain": World(), "beacon": World(beacon=True), "disparity": World(camera="disparity")}
@@ -52,7 +53,7 @@ class Recording(VecForest):
         """Keep all that there is to show of the moment after a step of reward r."""
         drone, s = self.drone, self.drone.observation  # (4, 84, 84)
         moment = {"pose": drone.pose, "d_obs": drone.d_obs, "reward": r, "return": drone.total}
-        moment |= {"q": self.q(torch.from_numpy(s[None]))[0].tolist()}  # A numbers
+        moment |= {"q": self.q.values(s[None], [drone])[0].tolist()}  # A numbers
         self.moments.append(moment | {"frame": b64encode(s[-1]).decode()})
 
 
@@ -161,7 +162,7 @@ class Hangar:
         last = [recording.moments[max(t - k, 0)]["pose"] for k in reversed(range(STACK))]
         names, s = without(np.array(last), recording)  # (R,), (R, 4, 84, 84)
         changed = np.flatnonzero((s != s[0]).any((1, 2, 3)))  # of R: what is in view
-        before, *after = recording.q(torch.from_numpy(s[[0, *changed]])).tolist()
+        before, *after = recording.q.values(s[[0, *changed]], ()).tolist()
         chosen = int(np.argmax(before))
         advantage, *rest = [q[chosen] - float(np.mean(q)) for q in (before, *after)]
         reasons = [
@@ -179,15 +180,11 @@ def without(poses: ndarray, recording: Recording) -> tuple[list[int], ndarray]:
     The names: -2 is nothing, -1 the goal's pole, others are numbers of trunks.
     """
     trunks, world = recording.drone.trunks, recording.world
-    ahead, left = seen_from(poses, trunks).T  # (N, 4), (N, 4) m
-    # As `draw_frames` does it: two radii to spare, because a trunk is wide.
+    ahead, left = np.stack([seen_from(pose, trunks) for pose in poses]).T  # (N, 4), (N, 4) m
+    # As `draw_frame` does it: two radii to spare, because a trunk is wide.
     inside = (ahead > 0) & (ahead < world.view) & (abs(left) < ahead + 2 * world.trunk_radius)
     near = np.flatnonzero(inside.any(1))  # (K,)
-    forests = np.repeat(trunks[None], 1 + len(near), 0)  # (1 + K, N, 2) m
-    forests[np.arange(len(near)) + 1, near] = 1e9  # m: out of sight
-    goal = (world.length, 0) if world.beacon else None
-    # (4 + 4 K, 3), and as many forests: one for each camera
-    cameras, seen = np.tile(poses, (len(forests), 1)), [f for f in forests for _ in poses]
     # In a world without a pole the last observation equals the first, and so is left out.
-    frames = [draw_frames(cameras, seen, world, goal), draw_frames(poses, [trunks] * STACK, world)]
-    return [-2, *near, -1], np.concatenate(frames).reshape(-1, *recording.drone.observation.shape)
+    scenes = [(trunks, world), *((np.delete(trunks, i, 0), world) for i in near)]
+    scenes.append((trunks, replace(world, beacon=False)))
+    return [-2, *near, -1], np.array([[draw_frame(p, *scene) for p in poses] for scene in scenes])

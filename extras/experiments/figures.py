@@ -20,10 +20,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from deepflight import draw_film, load_weights, measure
+from deepflight import load_weights, measure, save_film
 from env import World, plant
 from extras.lessons import looks
-from render import save_film
 
 ROOT = Path(__file__).parents[2]
 PAPER = 1.8  # the paper's figure: 180 % more flight time than random [DF, abstract]
@@ -73,11 +72,11 @@ def draw_looks() -> None:
     report = json.loads(looks.RESULT.read_text())
     tiles = [(camera, *item) for camera, flown in looks.LOOKS.items() for item in flown.items()]
     figure, panels = plt.subplots(-(-len(tiles) // 5), 5, figsize=(8.7, 8.5), layout="constrained")
-    pose, trunks = np.array([[43.0, -12.85, 0.19]]), [plant(looks.FORESTS[0], World())]
+    pose, trunks = (43.0, -12.85, 0.19), plant(looks.FORESTS[0], World())
     for axes, (camera, name, look) in zip(panels.flat, tiles, strict=False):
         pilots = [report[pilot][name] for pilot in report if pilot.startswith(camera)]
         shares = " / ".join(f"{100 * pilot['crossed']['value']:.0f}" for pilot in pilots)
-        frame = looks.wear(look, pose, trunks, World(camera=camera))[0]
+        frame = looks.wear(look, pose, trunks, World(camera=camera))
         axes.imshow(frame, "gray", vmin=0, vmax=255)
         axes.set_title(f"{camera}: {name}\ncrossed {shares} %", fontsize=9)
         axes.axis("off")
@@ -93,7 +92,7 @@ def main() -> None:
     episodes = report["pilots"][name]["episodes"]
     shown = episodes[measure(episodes)["crossed"].argmax()]
     film = ROOT / "figures/flight.gif"
-    save_film(film, draw_film(shown, world, q, name), round(1000 * world.dt))
+    save_film(film, shown, world, q, name)
     print("wrote figures/flight.gif")
 
 

@@ -71,7 +71,7 @@ from torch import Tensor, nn
 
 import dqn
 from deepflight import Config
-from dqn import Agent, InputError, Replay, due, greedy, linear_schedule, mirror, setting
+from dqn import Agent, InputError, Replay, due, linear_schedule, mirror, setting
 from env import Episode, VecForest, World
 from extras.lessons import recipe, run
 from extras.lessons.expert import laser_pilot, td_loss
@@ -175,7 +175,7 @@ def train(c: "DemoConfig", envs: VecForest, rng: Generator, shaped: Callable) ->
         s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
         random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
-        a = np.where(explore, random, greedy(agent.q, s))  # 8 (L,)
+        a = np.where(explore, random, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
         replay.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11
         updates = due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0

@@ -72,7 +72,7 @@ from torch import Tensor, nn
 
 import dqn
 from deepflight import Config
-from dqn import Agent, due, greedy, linear_schedule, setting, td_target
+from dqn import Agent, due, linear_schedule, setting, td_target
 from env import Drone, Pilot, VecForest, World
 from extras.lessons import recipe, run
 from render import raycast
@@ -88,8 +88,8 @@ def scan(drone: Drone) -> tuple[ndarray, ndarray]:
     (beams,) in m, 20 where nothing is hit within 20 m."""
     bearings = np.arange(BEAMS) * (2 * np.pi / BEAMS)  # (beams,)
     centres = drone.trunks - drone.pose[:2]  # (N, 2) m
-    distance, _ = raycast(centres, drone.world.trunk_radius, bearings + drone.pose[2])  # (1, beams)
-    return bearings, np.minimum(distance[0], drone.world.laser_range)
+    distance, _ = raycast(centres, drone.world.trunk_radius, bearings + drone.pose[2])  # (beams,)
+    return bearings, np.minimum(distance, drone.world.laser_range)
 
 
 def plan(bearings: ndarray, distances: ndarray, pose: tuple, world: World, c: Config) -> ndarray:
@@ -252,7 +252,7 @@ def train(c: "ExpertConfig", envs: VecForest, rng: Generator, shaped: Callable) 
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
         rng.integers(envs.num_actions, size=c.num_envs)  # [!] not flown
         best = envs.scores.argmax(1)  # (L,) [!]
-        a = np.where(explore, best, greedy(agent.q, s))  # 8 (L,) [!]
+        a = np.where(explore, best, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,) [!]
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
         replay.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11
         updates = due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0

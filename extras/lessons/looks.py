@@ -36,7 +36,7 @@ pose determine the noise. So an episode is still determined by its seed and its 
 interrupted training can go on.
 
 What differs from expert.py
-    env.draw_frames   while `train` runs, `wear_at_random` stands in its place
+    env.draw_frame   while `train` runs, `wear_at_random` stands in its place
 The network, the loss, the planner and the loop are the same.
 
 What came out, in 200 forests (results/transfer.json)
@@ -48,7 +48,6 @@ What came out, in 200 forests (results/transfer.json)
       So of these a real drone should get that one.
 
 Legend
-    E     drones that look at the same time
     level a step of a frame's 0 to 255
     [Tobin 2017]  Domain randomization for transferring deep neural networks from simulation to the
                   real world, IROS
@@ -71,12 +70,11 @@ import deepflight
 import env
 from extras.lessons import recipe
 from extras.lessons.expert import ExpertConfig
-from render import PIXELS, SLOPES, Scene, background, draw_frames, shade
+from render import PIXELS, SLOPES, Scene, background, draw_frame, shade
 
 ROOT = Path(__file__).parents[2]
 RESULT, FORESTS = ROOT / "results/transfer.json", range(6 * 10**9, 6 * 10**9 + 200)
 METRICS = ("crossed", "crash")
-Trunks = Sequence[ndarray]  # the forest (N, 2) in m of each drone
 
 
 @dataclass(frozen=True)
@@ -126,29 +124,28 @@ PILOTS = {  # name -> weights; the second and the fourth are made by `train`
 # -------------------------------------------------- what a look does to a frame
 
 
-def wear(look: Look, poses: ndarray, trunks: Trunks, scene: Scene, *beacon: Any) -> ndarray:
-    """What render.draw_frames draws, in this look: (E, 84, 84) uint8."""
+def wear(look: Look, pose: Sequence[float], trunks: ndarray, scene: Scene) -> ndarray:
+    """What render.draw_frame draws, in this look: (84, 84) uint8."""
     scene = replace(scene, **look.scene)
-    frames = draw_frames(poses, trunks, scene, *beacon)  # (E, 84, 84)
+    frame = draw_frame(pose, trunks, scene)  # (84, 84)
     if look.stripes and scene.camera == "grey":
-        disparity = draw_frames(poses, trunks, replace(scene, camera="disparity"), *beacon)
-        frames = paint_rings(frames, disparity, look, scene)
+        frame = paint_rings(
+            frame, draw_frame(pose, trunks, replace(scene, camera="disparity")), look, scene
+        )
     change = mismatch if scene.camera == "disparity" else expose
-    changed = []
-    for frame, pose, forest in zip(frames, poses, trunks, strict=True):
-        # Seeded by the bits of these numbers: as whole numbers, without the sign of zero.
-        rng = np.random.default_rng(np.abs([*pose, *forest[0]]).view(np.uint32))
-        changed.append(change(frame.astype(float), look, scene, rng))
-    return np.clip(np.rint(changed), 0, 255).astype(np.uint8)  # (E, 84, 84)
+    # Seeded by the bits of these numbers: as whole numbers, without the sign of zero.
+    rng = np.random.default_rng(np.abs([*pose, *trunks[0]]).view(np.uint32))
+    changed = change(frame.astype(float), look, scene, rng)  # (84, 84)
+    return np.clip(np.rint(changed), 0, 255).astype(np.uint8)
 
 
-def paint_rings(frames: ndarray, disparity: ndarray, look: Look, scene: Scene) -> ndarray:
-    """Bright rings around the trunks; frames, disparity: the same view, (E, 84, 84) both."""
-    trunk = disparity > background(replace(scene, camera="disparity"))  # (E, 84, 84)
-    depth = 255 * scene.near / np.maximum(disparity, 1)  # (E, 84, 84) m
-    height = scene.altitude + SLOPES[:, None] * depth  # (E, 84, 84) m above the ground
-    ring = trunk & (np.floor(height / look.stripes) % 2 == 0)  # (E, 84, 84)
-    return np.where(ring, shade(200, depth, depth, scene), frames)
+def paint_rings(frame: ndarray, disparity: ndarray, look: Look, scene: Scene) -> ndarray:
+    """Bright rings around the trunks; frame, disparity: the same view, (84, 84) both."""
+    trunk = disparity > background(replace(scene, camera="disparity"))  # (84, 84)
+    depth = 255 * scene.near / np.maximum(disparity, 1)  # (84, 84) m
+    height = scene.altitude + SLOPES[:, None] * depth  # (84, 84) m above the ground
+    ring = trunk & (np.floor(height / look.stripes) % 2 == 0)  # (84, 84)
+    return np.where(ring, shade(200, depth, depth, scene), frame)
 
 
 def expose(frame: ndarray, look: Look, _scene: Scene, rng: Generator) -> ndarray:
@@ -181,12 +178,12 @@ def mismatch(frame: ndarray, look: Look, scene: Scene, rng: Generator) -> ndarra
 
 @contextmanager
 def seeing(draw: Callable[..., ndarray]) -> Iterator[None]:
-    """Let every drone see what `draw` draws, a function like render.draw_frames."""
-    plain, env.draw_frames = env.draw_frames, draw
+    """Let every drone see what `draw` draws, a function like render.draw_frame."""
+    plain, env.draw_frame = env.draw_frame, draw
     try:
         yield
     finally:
-        env.draw_frames = plain
+        env.draw_frame = plain
 
 
 # -------------------------------------------------- train
@@ -210,13 +207,10 @@ def random_look(camera: str, rng: Generator) -> Look:
     return Look(paint, **lens, noise=maybe(15), stripes=max(stripes, 0.2) if stripes else 0.0)
 
 
-def wear_at_random(poses: ndarray, trunks: Trunks, scene: Scene, *beacon: Any) -> ndarray:
-    """What drones see that each wear the look of their forest: (E, 84, 84) uint8."""
-    frames = []
-    for pose, forest in zip(poses, trunks, strict=True):
-        rng = np.random.default_rng(np.abs(forest[0]).view(np.uint32))  # the same in each step
-        frames.append(wear(random_look(scene.camera, rng), pose[None], [forest], scene, *beacon))
-    return np.concatenate(frames)
+def wear_at_random(pose: Sequence[float], trunks: ndarray, scene: Scene) -> ndarray:
+    """What a drone sees that wears the look of its forest: (84, 84) uint8."""
+    rng = np.random.default_rng(np.abs(trunks[0]).view(np.uint32))  # the same in each step
+    return wear(random_look(scene.camera, rng), pose, trunks, scene)
 
 
 def train(

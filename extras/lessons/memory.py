@@ -28,7 +28,7 @@ it is 10 degrees a minute, then after 18 s the heading is wrong by 3 degrees, an
 a normal distribution whose standard deviation is 10 degrees a minute.
 
 **What differs from pqn.py**
-    QNetwork   forward gets the four numbers too; `senses` makes them of a drone's actions
+    QNetwork   forward gets the four numbers too; `poses` makes them of the drones' actions
     Rollout    keeps the four numbers of s and s2 beside them
     learn      passes them on; a reflection changes the sign of the sine and of y
     rewards    arrival pays more than the far edge, because now the drone can find the goal
@@ -60,7 +60,7 @@ from torch import Tensor, nn
 
 import dqn
 from deepflight import Config
-from dqn import greedy, linear_schedule
+from dqn import linear_schedule
 from env import Drone, VecForest, World
 from extras.lessons import pqn, recipe, run
 from extras.lessons.pqn import Agent, PQNConfig, lambda_returns, minibatches
@@ -105,12 +105,17 @@ class QNetwork(pqn.QNetwork):
             features = self.conv(grey)  # (B, 3136)
         return self.head(torch.cat([features.float(), self.place(pose)], 1))  # (B, A)
 
-    def senses(self, drones: Sequence[Drone], before: int = 0) -> tuple[Tensor]:
+    @torch.no_grad()
+    def values(self, s: ndarray, drones: Sequence[Drone]) -> ndarray:
+        """Q(s, .) (E, A) of E drones, for acting."""
+        return self(torch.from_numpy(s), torch.from_numpy(self.poses(drones))).numpy()
+
+    def poses(self, drones: Sequence[Drone], before: int = 0) -> ndarray:
         """The pose (E, 4) of each drone, or what it was so many steps before."""
         flown = [drone.actions[: len(drone.actions) - before] for drone in drones]
         biases = [np.radians(self.drift) / 60 * gyro_error(drone.seed) for drone in drones]  # rad/s
         each = zip(flown, (drone.world for drone in drones), biases, strict=True)
-        return (torch.from_numpy(np.stack([odometry(*one) for one in each])),)
+        return np.stack([odometry(*one) for one in each])
 
 
 class Rollout(pqn.Rollout):
@@ -122,7 +127,7 @@ class Rollout(pqn.Rollout):
 
     def add(self, *row: ndarray) -> None:
         """Keep a row and its poses. No drone is reset yet: the last action is that of this row."""
-        poses = (self.q.senses(self.envs.drones, before)[0].numpy() for before in (1, 0))
+        poses = (self.q.poses(self.envs.drones, before) for before in (1, 0))
         super().add(*row, *poses)
 
 
@@ -162,8 +167,7 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
         s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
         random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
-        pose = agent.q.senses(envs.drones)  # ((L, 4),) [!]
-        a = np.where(explore, random, greedy(agent.q, s, *pose))  # 8 (L,) [!]
+        a = np.where(explore, random, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
         rollout.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11
         if len(rollout.rows) == c.rollout:

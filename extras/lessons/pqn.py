@@ -75,7 +75,7 @@ from torch.optim.swa_utils import AveragedModel
 
 import dqn
 from deepflight import Config
-from dqn import greedy, linear_schedule, setting
+from dqn import linear_schedule, setting
 from env import VecForest, World
 from extras.lessons import recipe, run
 
@@ -193,7 +193,7 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
         s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
         random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
-        a = np.where(explore, random, greedy(agent.q, s))  # 8 (L,)
+        a = np.where(explore, random, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
         rollout.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11 [!]
         if len(rollout.rows) == c.rollout:  # [!]

@@ -7,6 +7,7 @@ import sys
 import threading
 from base64 import b64decode
 from collections.abc import Iterator
+from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from env import Pilot, World, fly, refly, straight_pilot
 from extras.cockpit.__main__ import LARGEST, Server
 from extras.cockpit.episodes import ROOT, Hangar
 from extras.lessons.expert import laser_pilot
-from render import draw_frames
+from render import draw_frame
 
 HOMES = {"plain": "dqn", "beacon": "dqn-beacon"}
 SEED, FIRST = 1, {"world": "plain", "weights": "dqn", "seed": "1"}
@@ -85,9 +86,9 @@ def test_the_random_pilot_flies_the_same_episode_each_time_that_it_is_asked(
 def test_q_and_frames_are_those_of_the_network_and_the_camera(server: Server) -> None:
     answer, (q, w) = flown(server), shipped("plain")
     steps, total = refly(answer["record"], w), 0.0
-    for moment, (s, drone) in zip(answer["moments"], steps, strict=True):
-        with torch.no_grad():
-            values = q(torch.from_numpy(s)[None])[0].tolist()
+    for moment, drone in zip(answer["moments"], steps, strict=True):
+        s = drone.observation  # (4, 84, 84)
+        values = q.values(s[None], ())[0].tolist()
         assert moment["q"] == pytest.approx(values, abs=1e-4)
         assert b64decode(moment["frame"]) == s[-1].tobytes()
         assert (moment["pose"], moment["d_obs"]) == ([*drone.pose], drone.d_obs)
@@ -104,12 +105,12 @@ def test_removal_is_what_one_gets_by_drawing_every_frame_again(
     whole = flown(server, **more)
     answer = ask(server, "/why", actions=whole["record"]["actions"], time=str(time), **more)
     poses = [whole["moments"][max(time - k, 0)]["pose"] for k in (3, 2, 1, 0)]
-    before = [s for s, _ in refly(whole["record"], w)][time]  # (4, 84, 84)
+    before = [drone.observation for drone in refly(whole["record"], w)][time]  # (4, 84, 84)
     trunks, found = np.array(whole["trunks"]), {}
     for i in range(-1 if w.beacon else 0, len(trunks)):
         left = trunks if i < 0 else np.delete(trunks, i, 0)
-        pole = (w.length, 0.0) if w.beacon and i >= 0 else None
-        s = np.concatenate([draw_frames(np.array([pose]), [left], w, pole) for pose in poses])
+        scene = w if i >= 0 else replace(w, beacon=False)
+        s = np.array([draw_frame(pose, left, scene) for pose in poses])
         if (s != before).any():
             with torch.no_grad():
                 found[i] = (q(torch.from_numpy(s)[None])[0].tolist(), s[-1].tobytes())

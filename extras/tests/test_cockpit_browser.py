@@ -31,7 +31,7 @@ from extras.experiments.cockpit_pictures import (
     visit,
 )
 from extras.lessons.demonstrations import DemoConfig, read_demos
-from render import draw_frames
+from render import draw_frame
 
 if not (CHROMIUM.exists() and DRIVER.exists()):
     pytest.skip("needs Debian's packages chromium and chromium-driver", allow_module_level=True)
@@ -202,9 +202,9 @@ def test_a_click_on_a_trunk_takes_it_out_of_the_decision(browser: Chrome, host: 
     circle = browser.find_elements(By.CSS_SELECTOR, "#trunks circle")[trunk]
     ActionChains(browser).move_to_element(circle).click().perform()
     until(browser, "removed")
-    poses = [drone.pose for _, drone in refly(value(browser, "episode.record"), World())]
+    poses = [drone.pose for drone in refly(value(browser, "episode.record"), World())]
     forest = np.delete(np.array(value(browser, "episode.trunks")), trunk, 0)
-    s = draw_frames(np.array(poses[27:31]), [forest] * 4, World())
+    s = np.array([draw_frame(pose, forest, World()) for pose in poses[27:31]])
     q = load_weights(ROOT / "weights/dqn.pt")[0]
     with torch.no_grad():
         values = q(torch.from_numpy(s)[None])[0].tolist()

@@ -89,7 +89,7 @@ def test_the_loss_is_that_of_td_targets_and_of_missed_margins(
 @pytest.fixture
 def demos(tmp_path: Path) -> str:
     """A file as eval --json writes it, two episodes of the laser pilot."""
-    episodes = fly(laser_pilot(0.99), [0, 1], WORLD, blind=True)
+    episodes = fly(laser_pilot(0.99), [0, 1], WORLD)
     path = tmp_path / "demos.json"
     path.write_text(json.dumps({"pilots": {"random": {}, "laser": {"episodes": episodes}}}))
     return str(path)

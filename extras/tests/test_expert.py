@@ -137,7 +137,7 @@ def test_the_candidates_reach_2_2_s_ahead_at_any_control_rate() -> None:
 
 def test_the_laser_pilot_arrives_and_never_crashes() -> None:
     first = deepflight.TEST_FIRST
-    episodes = fly(expert.laser_pilot(0.99), range(first, first + 20), WORLD, blind=True)
+    episodes = fly(expert.laser_pilot(0.99), range(first, first + 20), WORLD)
     assert not any(e["outcome"] == "crash" for e in episodes)
     assert sum(e["outcome"] == "goal" for e in episodes) >= 18
     assert sum(e["return"] for e in episodes) / 20 > 70
@@ -282,7 +282,7 @@ def test_where_q_would_explore_the_expert_flies(tmp_path: Path) -> None:
     run = finish(c, tmp_path / "run")
     for drone in run.envs.drones[:2]:
         assert len(drone.actions) == 160 // 8
-        alone = VecForest(WORLD, 1, [drone.seed], blind=True)
+        alone = VecForest(WORLD, 1, [drone.seed])
         alone.reset_done()
         for a in drone.actions:
             assert expert.expert_scores(alone, c)[0].argmax() == a
@@ -294,7 +294,7 @@ def test_eval_prints_the_laser_pilot_beside_the_shipped_network(
 ) -> None:
     shipped = Path(deepflight.__file__).parent / "weights/imitation.pt"
     words = ["eval", "--weights", str(shipped), "--episodes", "2", "--out", str(tmp_path)]
-    monkeypatch.setattr(deepflight.render, "save_film", lambda *film: None)
+    monkeypatch.setattr(deepflight, "save_film", lambda *film: None)
     assert run(ExpertConfig, words) == 0
     head = capsys.readouterr().out.splitlines()[2].split()
     assert head == ["random", "straight", "laser", "imitation"]
