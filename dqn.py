@@ -15,10 +15,10 @@ s is r plus gamma times the return from s2, so every transition (s, a, r, s2) ma
 
 In numbers: r = 0.5, and the greatest of the nine Q(s2, .) is 10. Then y = 0.5 + 0.99 * 10 = 10.4.
 If Q(s, a) is 8, its error is 2.4, and all weights are moved a little so that it grows. y is called
-the TD target (temporal difference), and the equation is Bellman's. A target that is made from
-another estimate bootstraps. That works because each target holds one true reward, and where a crash
-ends an episode the whole target is true. Take three steps with rewards 0.5, 0.5 and -10. Let there
-be one action only, let all Q be 0 at first, and let an update set all three to their targets:
+the TD target (temporal difference), and the equation is Bellman's. To make a target from another
+estimate is called bootstrapping. It works because each target holds one true reward, and where a
+crash ends an episode the whole target is true. Take three steps with rewards 0.5, 0.5 and -10, one
+action only, and let all Q be 0 at first. Each update sets all three to their targets:
 
                      Q of step 1   step 2   step 3
     after update 1       0.5         0.5     -10
@@ -28,9 +28,8 @@ be one action only, let all Q be 0 at first, and let an update set all three to 
 The truth moves backwards. Three things can go wrong, and DQN has an answer to each:
   * Steps that follow each other are alike (correlated samples), and a network that learns from them
     in that order forgets the rest. So a **replay** keeps transitions, and each update draws some at
-    random. They were made by older, worse agents, but y asks for the best action in s2 and not for
-    the one that was taken: Q-learning is off-policy. (Where a target holds several rewards this is
-    only nearly true, see `window`.)
+    random. Older agents made them, but y asks for the best action in s2 and not for the one that
+    was taken: Q-learning is off-policy. (With several rewards in a target nearly so, see `window`.)
   * Each update of Q also moves the targets. So they come from a **target network** Q^, a copy of Q
     that is synced only now and then.
   * An agent that always does what seems best never finds what is better. So it **explores**: with
@@ -56,14 +55,15 @@ Algorithm 1 of [Mnih15]. `train` carries its line numbers:
 
 Legend: phi(s) last four frames, theta weights; A actions, B transitions in a batch, L environments
 side by side, T rows of the replay. A pass is one control step of all environments. [+name] marks
-what our textbook [Mnih15] does not have; the setting of that name switches it off. Three more are
-always on: Adam, bfloat16 where the processor knows it, and rewards that are not clipped.
+what [Mnih15] does not have; the setting of that name switches it off. Three more are always on:
+Adam, bfloat16 where the processor knows it, and rewards that are not clipped to -1 .. 1.
 """
 
 import copy
+from collections import namedtuple
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -147,8 +147,8 @@ class QNetwork(nn.Module):
     def forward(self, s: Tensor, bfloat16: bool = False) -> Tensor:
         """Q(s, .) (B, A) float32 of s (B, 4, 84, 84) uint8; PyTorch calls this for q(s).
 
-        Even with bfloat16 the last layers stay float32. Values near 100 are common here, where
-        bfloat16 has steps of 0.5, so actions would tie. Acting uses float32 throughout.
+        Near 100, where many values are, bfloat16 has steps of 0.5, and actions would tie. So the
+        last layers stay float32, and acting uses nothing else.
         """
         grey = s.to(torch.bfloat16 if bfloat16 else torch.float32).div_(255)  # (B, 4, 84, 84) 0..1
         with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
@@ -162,15 +162,12 @@ class QNetwork(nn.Module):
         return self(torch.from_numpy(s)).numpy()
 
 
-class Batch(NamedTuple):
-    """B transitions drawn from the replay."""
-
-    s: Tensor  # (B, 4, 84, 84) uint8
-    a: Tensor  # (B,) int64
-    r: Tensor  # (B,) float32, the discounted sum of up to n_steps rewards
-    s2: Tensor  # (B, 4, 84, 84) uint8, the observation after them; meaningless after TERMINAL
-    gamma_n: Tensor  # (B,) float32, gamma to the number of rewards in r
-    end: Tensor  # (B,) uint8, how the transition ended
+# B transitions drawn from the replay:
+#     s (B, 4, 84, 84) uint8     a (B,) int64     r (B,) the discounted sum of up to n_steps rewards
+#     s2 (B, 4, 84, 84) uint8    the observation after these rewards; meaningless after TERMINAL
+#     gamma_n (B,)               gamma to the number of rewards in r
+#     end (B,) uint8             how the transition ended
+Batch = namedtuple("Batch", "s a r s2 gamma_n end")
 
 
 class Replay:
@@ -242,8 +239,8 @@ class Replay:
         """
         rows, envs = (row[:, None] + np.arange(n)) % self.rows, env[:, None]  # (B, n), (B, 1)
         live = self.ends[rows, envs] == LIVE  # (B, n)
-        # Reward k counts if none of the steps 0 to k - 1 ended the episode: 1, otherwise 0. In the
-        # example of the class, row 1 with n = 3: live 1 0 1, reached 1 1 0, count 2, last row 2.
+        # reached: 1 while no earlier step has ended the episode. In the example of the class, row 1
+        # with n = 3: live 1 0 1, so reached 1 1 0, count 2, and the last row is 2.
         reached = np.ones((len(row), n), np.float32)  # (B, n)
         reached[:, 1:] = np.cumprod(live[:, :-1], 1)
         discounts = np.float32(gamma) ** np.arange(n, dtype=np.float32)  # (n,)
@@ -251,8 +248,10 @@ class Replay:
         count = reached.sum(1).astype(int)  # (B,) rewards in r
         last = (row + count - 1) % self.rows  # (B,) the row of the last one
         end = self.ends[last, env]  # (B,)
+        # s2 stands one row on if the episode is live. If it was truncated, its newest frame is in
+        # last_frames. After a crash it is never used.
         s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), env)  # (B, 4, 84, 84)
-        for i in np.flatnonzero(end == TRUNCATED):  # s2 is still that of the last row
+        for i in np.flatnonzero(end == TRUNCATED):
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], env[i]]]
         s, a = self.stack(row, env), self.actions[row, env]  # (B, 4, 84, 84), (B,)
         gamma_n = np.float32(gamma) ** count.astype(np.float32)  # (B,)
@@ -287,11 +286,10 @@ class Agent(nn.Module):
     [+swa_fraction] Each update changes how Q flies, for better or worse. The mean of the weights
     over many updates is steadier (stochastic weight averaging), so it is what flies in the end.
 
-    Adam keeps two running means for each weight: m of its gradient g, and v of g^2. A running mean
-    goes a small part of the way to each new number: m = 0.9 * m + 0.1 * g. The weight moves by
-    -lr * m / (sqrt(v) + eps), so all weights move about equally fast, but for those with gradients
-    below eps. Rainbow's eps is 1.5e-4 [Hessel 2018]. Ours is huber_delta times that, because an
-    error may pull huber_delta times as hard.
+    Adam moves each weight by -lr * m / (sqrt(v) + eps), where m and v are running means of its
+    gradient g and of g^2, as in m = 0.9 * m + 0.1 * g. So all weights move about equally fast, but
+    for those with gradients below eps. Rainbow's eps is 1.5e-4 [Hessel 2018]. Ours is huber_delta
+    times that, because an error may pull huber_delta times as hard.
     """
 
     def __init__(self, c: DQNConfig, actions: int, rng: Generator) -> None:

@@ -6,7 +6,7 @@
     import gymnasium, extras.bridges.gym_env                     # from the root of the repository
     env = gymnasium.make("DeepFlight/Forest-v0", render_mode="rgb_array", beacon=True)
     observation, info = env.reset(seed=3_000_000_000)
-    envs = gymnasium.make_vec("DeepFlight/Forest-v0", num_envs=8)    # one camera call for all
+    envs = gymnasium.make_vec("DeepFlight/Forest-v0", num_envs=8)
 
 Observation: Box(0, 255, (4, 84, 84), uint8), oldest frame first. Action: Discrete(9), 0 turns
 right, 8 left. Every field of env.World is a keyword argument. The world itself truncates after
@@ -132,7 +132,7 @@ class Forest(gymnasium.Env):
 
 
 class Forests(VectorEnv):
-    """E drones side by side; one camera call draws what all of them see.
+    """E drones side by side.
 
     The arguments are those of Forest. max_episode_steps is what gymnasium.make_vec passes on; it
     stands for max_steps, unless that is given.
