@@ -27,8 +27,6 @@ A seed is a forest, and there are three sets of them:
 A run's folder holds config.json, log.csv, checkpoint.pt, and in best.pt the weights: those of the
 best validation until the last tenth of the steps, and from then on the mean of all since.
 
-Legend: L drones side by side in a training, F episodes, A actions.
-
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
     [Mnih15]            Human-level control through deep reinforcement learning, Nature 518
@@ -252,9 +250,6 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
     save_film(film, shown, world, q, name)
     print(f"\nwrote {film}: forest {shown['seed']}")
     return 0
-
-
-# -------------------------------------------------- statistics and the film
 
 
 def measure(episodes: list[Episode]) -> dict[str, ndarray]:

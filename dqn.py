@@ -124,14 +124,13 @@ class DQNConfig:
 class QNetwork(nn.Module):
     """The network of [Mnih15, Methods]: an observation goes in, Q(s, .) of all actions comes out.
 
-    It has layers, one after another. Each number that leaves a layer is a weighted sum of numbers
-    that enter it, plus a constant, its bias: with inputs 2 and -1, weights 3 and 4 and bias 1 it is
-    3 * 2 + 4 * -1 + 1 = 3. In a linear layer every output sees all inputs. In a convolution it sees
-    a small square, and all squares share the same few weights, called a filter. A filter of two
-    pixels with weights -1 and 1 makes 0 4 0 of the row 5 5 9 9: it finds the edge. Filters of 8x8
-    pixels that move on by 4 have (84 - 8) / 4 + 1 = 20 places in a row of 84. ReLU turns negative
-    numbers into 0; without it, two layers could do no more than one. The last layer has none,
-    because values may be negative.
+    Each number that leaves a layer is a weighted sum of numbers that enter it, plus a constant, its
+    bias: inputs 2 and -1, weights 3 and 4 and bias 1 make 3 * 2 + 4 * -1 + 1 = 3. In a linear layer
+    every output sees all inputs. In a convolution it sees a small square, with the same few weights
+    in every place, a filter. A filter of two pixels with weights -1 and 1 makes 0 4 0 of the row
+    5 5 9 9: it finds the edge. Filters of 8x8 pixels that move on by 4 have (84 - 8) / 4 + 1 = 20
+    places in a row of 84. ReLU turns negative numbers into 0; without it, two layers could do no
+    more than one. The last layer has none, because values may be negative.
     """
 
     def __init__(self, actions: int) -> None:
@@ -248,10 +247,9 @@ class Replay:
         count = reached.sum(1).astype(int)  # (B,) rewards in r
         last = (row + count - 1) % self.rows  # (B,) the row of the last one
         end = self.ends[last, env]  # (B,)
-        # s2 stands one row on if the episode is live. If it was truncated, its newest frame is in
-        # last_frames. After a crash it is never used.
+        # Where an episode goes on, s2 stands one row later; after a crash it is never used.
         s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), env)  # (B, 4, 84, 84)
-        for i in np.flatnonzero(end == TRUNCATED):
+        for i in np.flatnonzero(end == TRUNCATED):  # its newest frame is in no row
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], env[i]]]
         s, a = self.stack(row, env), self.actions[row, env]  # (B, 4, 84, 84), (B,)
         gamma_n = np.float32(gamma) ** count.astype(np.float32)  # (B,)

@@ -21,7 +21,7 @@ LABELS = {
 SEEDS = "dqn", "dqn-1", "dqn-2"
 FRONT = {  # heading -> file, pilot
     "DQN, seed 0": ("dqn", "dqn"), "seed 1": ("dqn-1", "dqn"), "seed 2": ("dqn-2", "dqn"),
-    "with the beacon": ("dqn-beacon", "dqn"),
+    "beacon, seed 0": ("dqn-beacon", "dqn"),
 }  # fmt: skip
 FULL = {
     "DQN": ("dqn", "dqn"), "DQN, beacon": ("dqn-beacon", "dqn"),
