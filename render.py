@@ -55,6 +55,7 @@ Not in this file: textures, shadows, leaning trunks, a drone that climbs.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -128,6 +129,7 @@ def shade(grey: ndarray | float, air: ndarray | float, depth: ndarray, scene: Sc
     return scene.sky + (grey - scene.sky) * np.maximum(1 - air / scene.view, 0)
 
 
+@cache
 def background(scene: Scene) -> ndarray:
     """The column (84, 1) uint8 behind all trunks: sky above the horizon, ground below. A row of
     slope -t meets the ground at depth altitude / t."""
@@ -141,8 +143,9 @@ def paint(frame: ndarray, depth: ndarray, height: float, value: ndarray, scene: 
     depth (84,): m, of their surface in each column, inf where there is none. height: m. value
     (84,): of their pixels, see `shade`.
     """
-    above = scene.altitude + SLOPES[:, None] * depth  # (84, 84) m, of each pixel over the ground
-    return np.where((above > 0) & (above <= height), value.astype(np.uint8), frame)
+    foot, top = (h / depth for h in (-scene.altitude, height - scene.altitude))  # (84,) slopes
+    inside = (SLOPES[:, None] > foot) & (SLOPES[:, None] <= top)  # (84, 84)
+    return np.where(inside, value.astype(np.uint8), frame)
 
 
 def draw_frame(pose: Sequence[float], trunks: ndarray, scene: Scene) -> ndarray:
