@@ -95,10 +95,9 @@ class Scene:
 def raycast(centres: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray, ndarray]:
     """Find what each ray of a camera hits first. The camera may not stand inside a trunk.
 
-    centres (N, 2): how far ahead and to the left each trunk stands, m. radius: m.
-    bearings (M,): rad.
-    Returns the distance (M,) in m along each ray, inf where it hits nothing, and the cosine (M,) of
-    the angle of incidence, 0 where it hits nothing.
+    centres (N, 2): m, how far ahead and to the left each trunk stands. radius: m. bearings (M,):
+    rad. Returns the distance (M,) in m along each ray and the cosine (M,) of the angle of
+    incidence; where a ray hits nothing they are inf and 0.
 
     >>> raycast(np.array([[5.0, 0.0]]), 0.5, np.array([0.0, 1.0]))
     (array([4.5, inf]), array([1., 0.]))
@@ -139,10 +138,7 @@ def background(scene: Scene) -> ndarray:
 
 def paint(frame: ndarray, depth: ndarray, height: float, value: ndarray, scene: Scene) -> ndarray:
     """The frame, a column (84, 1) or (84, 84), with upright cylinders drawn over it: (84, 84).
-
-    depth (84,): m, of their surface in each column, inf where there is none. height: m. value
-    (84,): of their pixels, see `shade`.
-    """
+    depth (84,): m, of their surface, inf where there is none. value (84,): of their pixels."""
     foot, top = (h / depth for h in (-scene.altitude, height - scene.altitude))  # (84,) slopes
     inside = (SLOPES[:, None] > foot) & (SLOPES[:, None] <= top)  # (84, 84)
     return np.where(inside, value.astype(np.uint8), frame)
