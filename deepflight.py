@@ -132,8 +132,11 @@ class Run:
         torch.set_num_threads(c.threads)
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log = c, folder, []
-        self.rng, self.forests = np.random.default_rng(c.seed), np.random.default_rng([c.seed, 1])
-        seeds = (int(self.forests.integers(TRAIN_END)) for _ in count())
+        self.rng, self.forest_rng = (
+            np.random.default_rng(c.seed),
+            np.random.default_rng([c.seed, 1]),
+        )
+        seeds = (int(self.forest_rng.integers(TRAIN_END)) for _ in count())
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)
         self.agent, self.replay = next(self.loop)
@@ -164,8 +167,8 @@ class Run:
         """Fly the validation forests without exploring, add a row to the log, and keep the weights
         of the best score: the share that crossed (with the beacon: arrived), then the progress. The
         mean of the weights is kept whatever its score, because the best of many is partly luck."""
-        envs, averaged = self.envs, self.agent.mean.n_averaged > 0
-        q = copy.deepcopy(self.agent.mean.module if averaged else self.agent.q)
+        envs, averaged = self.envs, self.agent.averaged.n_averaged > 0
+        q = copy.deepcopy(self.agent.averaged.module if averaged else self.agent.q)
         q.half().float()  # best.pt keeps half precision: fly that
         recent = measure(envs.episodes[-100:] or [drone.episode() for drone in envs.drones])
         flown = measure(fly(dqn_pilot(q), VALIDATION, envs.world))
@@ -188,8 +191,8 @@ class Run:
 
     def save(self) -> None:
         """Write the checkpoint, 34 MB. Of the replay it holds the actions, one byte each."""
-        content = {"config": asdict(self.c), "kind": kind(self.c), "log": self.log,
-                   "actions": self.envs.history, "forests": self.forests.bit_generator.state,
+        content = {"config": asdict(self.c), "fingerprint": fingerprint(self.c), "log": self.log,
+                   "actions": self.envs.history, "forests": self.forest_rng.bit_generator.state,
                    "rng": self.rng.bit_generator.state, "agent": self.agent.state_dict(),
                    "optimizer": self.agent.optimizer.state_dict()}  # fmt: skip
         save(self.folder / "checkpoint.pt", content)
@@ -203,13 +206,13 @@ class Run:
             s2, r, terminated, truncated, drones = self.envs.step(actions)
             r = shaped_reward(r, drones, self.c)  # (L,)
             self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
-        if self.forests.bit_generator.state != saved["forests"]:  # more or fewer have begun
+        if self.forest_rng.bit_generator.state != saved["forests"]:  # more or fewer have begun
             raise InputError(f"{self.folder}: its actions lead to other episodes on this machine")
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state, self.log = saved["rng"], saved["log"]
         if saved["config"]["steps"] != self.c.steps:
-            self.agent.mean.n_averaged.zero_()  # a longer training averages its own last share
+            self.agent.averaged.n_averaged.zero_()  # a longer training averages its own last share
 
 
 def dqn_pilot(q: QNetwork) -> Pilot:
@@ -271,9 +274,9 @@ def summarize(episodes: list[Episode], baseline: list[Episode], forests: int) ->
     """
     draws = np.random.default_rng(0).integers(forests, size=(2000, forests))
     means = {key: x.reshape(-1, forests).mean(0) for key, x in measure(episodes).items()}
-    random = measure(baseline)["steps"].reshape(-1, forests).mean(0)  # (forests,)
-    ratios = means["steps"][draws].mean(1) / random[draws].mean(1)  # (2000,) the same forests
-    metrics = {"longer": interval(means["steps"].mean() / random.mean() - 1, ratios - 1)}
+    random_steps = measure(baseline)["steps"].reshape(-1, forests).mean(0)  # (forests,)
+    ratios = means["steps"][draws].mean(1) / random_steps[draws].mean(1)  # (2000,) the same forests
+    metrics = {"longer": interval(means["steps"].mean() / random_steps.mean() - 1, ratios - 1)}
     for key, x in means.items():
         share = key in ("crossed", *env.OUTCOMES)
         metrics[key] = wilson(x.mean(), forests) if share else interval(x.mean(), x[draws].mean(1))
@@ -317,7 +320,7 @@ def save_film(path: Path, episode: Episode, world: World, q: QNetwork, name: str
         places.append(drone.pose[:2])
         values = q.values(drone.observation[None], [drone])[0]  # (A,)
         text = f"{name}: {t * world.dt:.1f} s, {drone.d_goal:.1f} m to the goal\n"
-        text += f"reward so far {drone.total:.1f}   {drone.outcome}"
+        text += f"reward so far {drone.episode_return:.1f}   {drone.outcome}"
         pictures.append(render.draw_panel(drone, np.array(places), values, text))
     ms = round(1000 * world.dt)
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=ms, loop=0)
@@ -355,7 +358,7 @@ def load(path: Path | str, *keys: str) -> dict[str, Any]:
 
 
 def save_weights(path: Path, q: QNetwork, c: Config) -> None:
-    """Write a weights file, 3.4 MB: a network in half precision, its kind, and its world."""
+    """Write a weights file, 3.4 MB: a network in half precision, its pilot, and its world."""
     network = {name: tensor.half() for name, tensor in q.state_dict().items()}
     save(path, {"pilot": c.pilot, "beacon": c.beacon, "camera": c.camera, "network": network})
 
@@ -372,7 +375,7 @@ def load_weights(path: Path | str, network: type = QNetwork) -> tuple[QNetwork, 
     return q, World(beacon=saved["beacon"], camera=saved["camera"]), saved["pilot"]
 
 
-def kind(c: Config | type[Config]) -> list:
+def fingerprint(c: Config | type[Config]) -> list:
     """What must be the same where a training goes on, or its numbers would differ."""
     return [c.pilot, str(torch.__version__), f"bfloat16 {dqn.BFLOAT16}"]
 
@@ -432,13 +435,14 @@ def start(args: argparse.Namespace, config: type[Config]) -> Run:
         return Run(config(**recipe | given), folder)
     if args.name or given.keys() - {"steps"}:
         raise InputError(f"{args.resume} keeps its settings: only --steps may be given")
-    keys = "config", "kind", "actions", "forests", "agent", "optimizer", "rng", "log"
+    keys = "config", "fingerprint", "actions", "forests", "agent", "optimizer", "rng", "log"
     saved = load(args.resume / "checkpoint.pt", *keys)
-    if saved["kind"] != kind(config):
-        raise InputError(f"{args.resume} is of kind {saved['kind']}, here is {kind(config)}")
+    if saved["fingerprint"] != fingerprint(config):
+        made, here = saved["fingerprint"], fingerprint(config)
+        raise InputError(f"{args.resume} was made by {made}, and here is {here}")
     c = config(**saved["config"] | given)
-    if (flown := len(saved["actions"]) * c.num_envs) >= c.steps:
-        raise InputError(f"{args.resume} has flown {flown:,} steps: give more by --steps")
+    if (steps := len(saved["actions"]) * c.num_envs) >= c.steps:
+        raise InputError(f"{args.resume} has flown {steps:,} steps: give more by --steps")
     return Run(c, args.resume, saved)
 
 

@@ -106,7 +106,7 @@ class DQNConfig:
     n_steps: int = setting(5, "[+] true rewards in a target; 1: off", 1, 100)
     mirror: bool = setting(True, "[+] reflect half of every batch; --no-mirror: off", 0, 1)
     huber_delta: float = setting(10.0, "[+] greater TD errors pull no harder; 1: Mnih's", 1e-3, 1e6)
-    lr_decay: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
+    lr_final: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
     swa_fraction: float = setting(0.1, "[+] last share, whose weights are averaged; 0: off", 0, 0.5)
 
     def __post_init__(self) -> None:
@@ -296,7 +296,7 @@ class Agent(nn.Module):
             torch.manual_seed(int(rng.integers(2**63)))
             self.q = QNetwork(actions).to(memory_format=torch.channels_last)  # line 2
         self.q_target = copy.deepcopy(self.q)  # line 3
-        self.mean = torch.optim.swa_utils.AveragedModel(self.q)  # [+swa_fraction]
+        self.averaged = torch.optim.swa_utils.AveragedModel(self.q)  # [+swa_fraction]
         eps = 1.5e-4 * c.huber_delta
         self.optimizer = torch.optim.Adam(self.q.parameters(), c.lr, eps=eps, fused=True)
         self.epsilon, self.loss = 1.0, 0.0
@@ -395,12 +395,12 @@ def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator
     while envs.steps < c.steps:
         step = envs.steps + c.num_envs  # control steps, this pass included
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
-        lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
+        lr = linear_schedule(step, c.lr, c.lr * c.lr_final, c.steps)  # [+lr_final]
         agent.optimizer.param_groups[0]["lr"] = lr
         s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
-        random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
-        a = np.where(explore, random, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,)
+        random_a = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
+        a = np.where(explore, random_a, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
         replay.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11
         updates = due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0
@@ -409,7 +409,7 @@ def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator
             batch = mirror(batch, envs.num_actions, rng) if c.mirror else batch  # [+mirror]
             learn(agent, batch, c)  # 13, 14
             if c.swa_fraction and step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction]
-                agent.mean.update_parameters(agent.q)
+                agent.averaged.update_parameters(agent.q)
         if due(c.target_every, step, c.num_envs):
             agent.q_target.load_state_dict(agent.q.state_dict())  # 15
         yield agent, replay

@@ -144,7 +144,7 @@ class Drone:
         self.space.reindex_static()  # tells pymunk that they moved
         self.body.position, self.body.angle, self.pose = (0.0, 0.0), 0.0, (0.0, 0.0, 0.0)
         self.actions, self.outcome = [], ""
-        self.progress = self.total = 0.0
+        self.progress = self.episode_return = 0.0
         self.sense()
 
     def step(self, action: int) -> float:
@@ -164,7 +164,7 @@ class Drone:
         self.sense()
         self.outcome = self.judge()
         r = reward(self.outcome, self.d_obs, self.d_goal, world)
-        self.total += r
+        self.episode_return += r
         return r
 
     def sense(self) -> None:
@@ -192,7 +192,7 @@ class Drone:
         """The episode so far: seed, actions as one digit each, and what came of them."""
         return {"seed": self.seed, "actions": "".join(map(str, self.actions)),
                 "outcome": self.outcome, "steps": len(self.actions), "progress": self.progress,
-                "return": self.total}  # fmt: skip
+                "return": self.episode_return}  # fmt: skip
 
 
 class VecForest:

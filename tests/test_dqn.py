@@ -165,7 +165,7 @@ def test_an_agent_is_a_function_of_its_seed_and_begins_with_two_equal_networks()
     before, one = torch.random.get_rng_state(), agent(DQNConfig())
     assert (torch.random.get_rng_state() == before).all()
     assert same(one, agent(DQNConfig())) and not same(one, agent(DQNConfig(), seed=1))
-    assert same(one.q, one.q_target) and one.mean.n_averaged == 0
+    assert same(one.q, one.q_target) and one.averaged.n_averaged == 0
     assert len({id(p) for p in one.parameters()}) == 3 * 10  # and the three share no weights
 
 
@@ -227,7 +227,7 @@ class Corridor:
 
 WALK = DQNConfig(
     steps=800, num_envs=4, gamma=0.9, replay_size=800, learning_starts=100, batch_size=16,
-    target_every=50, epsilon_final=1.0, lr=1e-3, lr_decay=0.02, n_steps=1, mirror=False,
+    target_every=50, epsilon_final=1.0, lr=1e-3, lr_final=0.02, n_steps=1, mirror=False,
     huber_delta=1.0, swa_fraction=0.0,
 )  # fmt: skip
 
@@ -242,7 +242,7 @@ def test_dqn_solves_a_tiny_mdp() -> None:
 
 
 def test_the_loop_acts_greedily_syncs_the_target_network_and_averages_the_last_share() -> None:
-    c = replace(WALK, steps=160, learning_starts=80, batch_size=4, target_every=36, lr_decay=0.5)
+    c = replace(WALK, steps=160, learning_starts=80, batch_size=4, target_every=36, lr_final=0.5)
     c, envs = replace(c, epsilon_final=0.0, epsilon_decay=1, swa_fraction=0.25), Corridor()
     loop = dqn.train(c, envs, np.random.default_rng(0), lambda r, *_: r)
     one, replay = next(loop)
@@ -259,8 +259,8 @@ def test_the_loop_acts_greedily_syncs_the_target_network_and_averages_the_last_s
         synced = q if step % 36 == 0 else synced
         assert torch.equal(one.q_target.head[2].weight, synced)
         last += [q] if step > 120 else []
-    assert one.mean.n_averaged == len(last) == 10
-    assert torch.allclose(one.mean.module.head[2].weight, torch.stack(last).mean(0), atol=1e-6)
+    assert one.averaged.n_averaged == len(last) == 10
+    assert torch.allclose(one.averaged.module.head[2].weight, torch.stack(last).mean(0), atol=1e-6)
 
 
 def test_the_loop_carries_the_numbers_of_algorithm_1_in_order() -> None:

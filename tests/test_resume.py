@@ -20,7 +20,7 @@ import dqn
 from deepflight import Config, Run, load, main
 from env import World
 
-KEYS = ("config", "kind", "actions", "forests", "agent", "optimizer", "rng", "log")
+KEYS = ("config", "fingerprint", "actions", "forests", "agent", "optimizer", "rng", "log")
 SMALL = {"steps": 400, "learning_starts": 100, "replay_size": 200, "target_every": 120}
 SMALL |= {"update_every": 16, "batch_size": 8}  # the replay wraps at step 200
 WORDS = [x for key, n in SMALL.items() for x in (f"--{key.replace('_', '-')}", str(n))]
@@ -121,7 +121,7 @@ def test_a_finished_training_goes_on_when_it_gets_more_steps(whole: Run, tmp_pat
     assert after.startswith(before) and after.count("\n") == before.count("\n") + 1
     saved = load(tmp_path / "more" / "checkpoint.pt", *KEYS)
     assert saved["config"]["steps"] == 480 and len(saved["actions"]) == 480 // 8
-    assert saved["agent"]["mean.n_averaged"] == 3  # updates of its own last tenth, from 433 on
+    assert saved["agent"]["averaged.n_averaged"] == 3  # updates of its own last tenth, from 433 on
 
 
 def test_what_does_not_fit_a_checkpoint_is_refused(
@@ -138,7 +138,7 @@ def test_what_does_not_fit_a_checkpoint_is_refused(
         ("--threads 2 --steps 480", Small, whole.folder, "keeps its settings"),
         ("", Small, whole.folder, "has flown 400 steps"),
         ("--steps 200", Small, whole.folder, "has flown 400 steps"),
-        ("--steps 480", Other, whole.folder, "is of kind ['dqn'"),
+        ("--steps 480", Other, whole.folder, "was made by ['dqn'"),
         ("--steps 480", Small, tmp_path, "other episodes on this machine"),
     ):
         assert main(["train", "--resume", str(folder), *words.split()], config) == 2

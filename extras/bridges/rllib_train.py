@@ -93,7 +93,7 @@ def make_config(c: Config, runners: int) -> RayConfig:
     # RLlib counts one runner too many when it works out how often to learn.
     intensity = c.batch_size / c.update_every * runners / (runners + 1)
     learning = dict(
-        lr=[[0, c.lr], [c.steps, c.lr * c.lr_decay]], gamma=c.gamma, n_step=c.n_steps,
+        lr=[[0, c.lr], [c.steps, c.lr * c.lr_final]], gamma=c.gamma, n_step=c.n_steps,
         double_q=c.double, dueling=False, num_atoms=1, epsilon=epsilon,
         train_batch_size_per_learner=c.batch_size, training_intensity=intensity,
         num_steps_sampled_before_learning_starts=c.learning_starts, td_error_loss_fn="huber",

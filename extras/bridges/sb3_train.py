@@ -59,7 +59,7 @@ def make_model(c: Config, replay: int = REPLAY) -> DQN:
     return DQN(
         "CnnPolicy",
         make_envs(c, "training"),
-        learning_rate=lambda left: linear_schedule(1 - left, c.lr, c.lr * c.lr_decay, 1),
+        learning_rate=lambda left: linear_schedule(1 - left, c.lr, c.lr * c.lr_final, 1),
         buffer_size=replay,
         learning_starts=c.learning_starts,
         batch_size=c.batch_size,

@@ -60,7 +60,7 @@ RUNGS = {
     "2 + Double": back("double"),
     "3 + five-step returns": back("n_steps"),
     "4 + mirror images": back("mirror"),
-    "5 + loss and learning rate": back("huber_delta", "lr_decay"),
+    "5 + loss and learning rate": back("huber_delta", "lr_final"),
     "6 + mean of the weights": back("swa_fraction"),
     "7 + shaped reward": back("forward_reward", "goal_bonus", "far_bonus"),
 }
@@ -69,7 +69,7 @@ CONTROLS = {
     "huber 1, a quarter of lr": ("--huber-delta", "1", "--lr", "6e-5"),
     "huber 100": ("--huber-delta", "100"),
     "huber 100, twice the lr": ("--huber-delta", "100", "--lr", "5e-4"),
-    "without Double, decay, mean": ("--no-double", "--lr-decay", "1", "--swa-fraction", "0"),
+    "without Double, decay, mean": ("--no-double", "--lr-final", "1", "--swa-fraction", "0"),
 }
 
 

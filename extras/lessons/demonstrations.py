@@ -170,12 +170,12 @@ def train(c: "DemoConfig", envs: VecForest, rng: Generator, shaped: Callable) ->
     while envs.steps < c.steps:
         step = envs.steps + c.num_envs  # control steps, this pass included
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
-        lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
+        lr = linear_schedule(step, c.lr, c.lr * c.lr_final, c.steps)  # [+lr_final]
         agent.optimizer.param_groups[0]["lr"] = lr
         s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
-        random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
-        a = np.where(explore, random, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,)
+        random_a = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
+        a = np.where(explore, random_a, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
         replay.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11
         updates = due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0
@@ -184,7 +184,7 @@ def train(c: "DemoConfig", envs: VecForest, rng: Generator, shaped: Callable) ->
             batch = mirror(batch, envs.num_actions, rng) if c.mirror else batch  # [+mirror]
             learn(agent, batch, c)  # 13, 14 [!]
             if c.swa_fraction and step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction]
-                agent.mean.update_parameters(agent.q)
+                agent.averaged.update_parameters(agent.q)
         if due(c.target_every, step, c.num_envs):
             agent.q_target.load_state_dict(agent.q.state_dict())  # 15
         yield agent, replay

@@ -246,7 +246,7 @@ def train(c: "ExpertConfig", envs: VecForest, rng: Generator, shaped: Callable) 
     while envs.steps < c.steps:
         step = envs.steps + c.num_envs  # control steps, this pass included
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
-        lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
+        lr = linear_schedule(step, c.lr, c.lr * c.lr_final, c.steps)  # [+lr_final]
         agent.optimizer.param_groups[0]["lr"] = lr
         s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
@@ -261,7 +261,7 @@ def train(c: "ExpertConfig", envs: VecForest, rng: Generator, shaped: Callable) 
             batch = mirror(batch, envs.num_actions, rng) if c.mirror else batch  # [+mirror] [!]
             learn(agent, batch, c)  # 13, 14 [!]
             if c.swa_fraction and step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction]
-                agent.mean.update_parameters(agent.q)
+                agent.averaged.update_parameters(agent.q)
         if due(c.target_every, step, c.num_envs):
             agent.q_target.load_state_dict(agent.q.state_dict())  # 15
         yield agent, replay
@@ -275,7 +275,7 @@ ExpertConfig = recipe(
     command="-m extras.lessons.expert", pilot="imitation", train=staticmethod(train),
     baselines=Config.baselines | {"laser": laser_pilot(Config.gamma)}, validate_every=20_000,
     bellman=setting(False, "learn from TD targets too", 0, 1),
-    learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000, lr_decay=0.0,
+    learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000, lr_final=0.0,
     forward_reward=1.0, far_bonus=115.0,
 )  # fmt: skip
 

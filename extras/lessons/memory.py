@@ -162,25 +162,25 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
     while envs.steps < c.steps:
         step = envs.steps + c.num_envs  # control steps, this pass included
         agent.epsilon = linear_schedule(step, 1.0, c.epsilon_final, c.epsilon_decay)
-        lr = linear_schedule(step, c.lr, c.lr * c.lr_decay, c.steps)  # [+lr_decay]
+        lr = linear_schedule(step, c.lr, c.lr * c.lr_final, c.steps)  # [+lr_final]
         agent.optimizer.param_groups[0]["lr"] = lr
         s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
-        random = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
-        a = np.where(explore, random, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,)
+        random_a = rng.integers(envs.num_actions, size=c.num_envs)  # (L,)
+        a = np.where(explore, random_a, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,)
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10
         rollout.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11
         if len(rollout.rows) == c.rollout:
             learn(agent, rollout, c, rng)  # 12, 13, 14
             if c.swa_fraction and step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction]
-                agent.mean.update_parameters(agent.q)
+                agent.averaged.update_parameters(agent.q)
         yield agent, rollout
 
 
 MemoryConfig = recipe(
     "MemoryConfig", PQNConfig,
     command="-m extras.lessons.memory", pilot="memory", train=staticmethod(train),
-    network=QNetwork, steps=220_000, lr_decay=0.05, swa_fraction=0.2,
+    network=QNetwork, steps=220_000, lr_final=0.05, swa_fraction=0.2,
     forward_reward=0.25, goal_bonus=200.0, far_bonus=20.0,
 )  # fmt: skip
 

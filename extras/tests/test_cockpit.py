@@ -93,7 +93,7 @@ def test_q_and_frames_are_those_of_the_network_and_the_camera(server: Server) ->
         assert b64decode(moment["frame"]) == s[-1].tobytes()
         assert (moment["pose"], moment["d_obs"]) == ([*drone.pose], drone.d_obs)
         total += moment["reward"]
-        assert total == pytest.approx(drone.total) == pytest.approx(moment["return"])
+        assert total == pytest.approx(drone.episode_return) == pytest.approx(moment["return"])
 
 
 @pytest.mark.parametrize("world", HOMES)

@@ -149,7 +149,7 @@ def test_the_laser_pilot_arrives_and_never_crashes() -> None:
 def test_the_recipe_differs_from_dqn_s_in_what_its_comment_says() -> None:
     own, base = asdict(ExpertConfig()), asdict(Config())
     assert {key: own[key] for key in own if own[key] != base.get(key)} == dict(
-        learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000, lr_decay=0.0,
+        learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000, lr_final=0.0,
         forward_reward=1.0, far_bonus=115.0, bellman=False,
     )  # fmt: skip
     assert (ExpertConfig.pilot, ExpertConfig.validate_every) == ("imitation", 20_000)

@@ -129,7 +129,7 @@ def test_the_settings_are_ours() -> None:
     assert model.gradient_steps / model.n_envs == 1 / c.update_every
     assert model.target_update_interval == c.target_every
     assert (model.batch_size, model.gamma, model.n_steps) == (c.batch_size, c.gamma, c.n_steps)
-    assert [model.lr_schedule(left) for left in (1, 0)] == pytest.approx([c.lr, c.lr * c.lr_decay])
+    assert [model.lr_schedule(left) for left in (1, 0)] == pytest.approx([c.lr, c.lr * c.lr_final])
     eps = [model.exploration_schedule(1 - step / c.steps) for step in (0, c.epsilon_decay, c.steps)]
     assert eps == pytest.approx([1, c.epsilon_final, c.epsilon_final])
     ours = Agent(replace(c, huber_delta=1.0), 9, np.random.default_rng(0)).optimizer
