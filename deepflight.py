@@ -132,10 +132,8 @@ class Run:
         torch.set_num_threads(c.threads)
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log = c, folder, []
-        self.rng, self.forest_rng = (
-            np.random.default_rng(c.seed),
-            np.random.default_rng([c.seed, 1]),
-        )
+        self.rng = np.random.default_rng(c.seed)
+        self.forest_rng = np.random.default_rng([c.seed, 1])  # so exploring changes no forest
         seeds = (int(self.forest_rng.integers(TRAIN_END)) for _ in count())
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)
@@ -437,9 +435,8 @@ def start(args: argparse.Namespace, config: type[Config]) -> Run:
         raise InputError(f"{args.resume} keeps its settings: only --steps may be given")
     keys = "config", "fingerprint", "actions", "forests", "agent", "optimizer", "rng", "log"
     saved = load(args.resume / "checkpoint.pt", *keys)
-    if saved["fingerprint"] != fingerprint(config):
-        made, here = saved["fingerprint"], fingerprint(config)
-        raise InputError(f"{args.resume} was made by {made}, and here is {here}")
+    if (made_by := saved["fingerprint"]) != (here := fingerprint(config)):
+        raise InputError(f"{args.resume} was made by {made_by}, and here is {here}")
     c = config(**saved["config"] | given)
     if (steps := len(saved["actions"]) * c.num_envs) >= c.steps:
         raise InputError(f"{args.resume} has flown {steps:,} steps: give more by --steps")

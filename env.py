@@ -154,7 +154,7 @@ class Drone:
         """
         world = self.world
         if self.outcome or not 0 <= action < world.num_actions:
-            raise ValueError(f"action {action} is none, or the episode is over: {self.outcome!r}")
+            raise ValueError(f"no action {action}, or the episode is over: {self.outcome!r}")
         self.actions.append(int(action))
         yaw_rate = world.yaw_rate * (2 * action / (world.num_actions - 1) - 1)  # rad/s
         heading = self.body.angle + yaw_rate * world.dt  # rad: turn first, then fly
