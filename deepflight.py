@@ -24,8 +24,8 @@ A seed is a forest, and there are three sets of them:
     validation  [10^9, 2 * 10^9)    may choose the weights (best.pt)
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
-A run's folder holds config.json, log.csv, checkpoint.pt, and in best.pt the weights: those of the
-best validation until the last tenth of the steps, and from then on the mean of all since.
+A run's folder holds config.json, log.csv, checkpoint.pt and best.pt, the weights: those of the best
+validation, and once the last tenth of the steps has begun the mean of all weights in it.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -98,16 +98,16 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
 
     forward_reward: r pays for being somewhere and not for getting on, so a drone that circles in
     one place earns as much as one that flies past it.
-    goal_bonus: arrival ends the episode, and with it all rewards. A drone that could stay near the
-    goal for ever would earn at most 1.25 + 0.99 * 1.25 + ... = 1.25 / (1 - 0.99) = 125. So arrival
-    earns as much, or staying would be better: 1.25 in its own step, and then 0.99 * 125.
+    goal_bonus: arrival ends the episode, and with it all rewards. To stay near the goal for ever
+    would earn 1.25 + 0.99 * 1.25 + ... = 1.25 / (1 - 0.99) = 125 at most. So arrival earns as much:
+    1.25 at once, and 125 as if in the next step, where it counts 0.99 times.
     far_bonus: no frame shows which edge is the far one, so a drone that leaves does not know
     whether it gets -10 or 188. The bonus makes this risk worth taking; 200 was found by trial. It
     changes the task: the paper counts the far edge as a crash, and here it is worth more than
     arrival. So look at the share that arrived too, and not only at the share that crossed.
 
-    On purpose, these parts change which way of flying is best. Potential-based shaping would not
-    [Ng 1999]. Every return that is printed or logged is the paper's.
+    On purpose, these parts change which way of flying is best: they are not potential-based, as
+    gamma * f(s2) - f(s) is for any f [Ng 1999]. Every printed or logged return is the paper's.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -133,7 +133,7 @@ class Run:
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log = c, folder, []
         self.rng = np.random.default_rng(c.seed)
-        self.forest_rng = np.random.default_rng([c.seed, 1])  # so exploring changes no forest
+        self.forest_rng = np.random.default_rng([c.seed, 1])  # exploring changes no forest
         seeds = (int(self.forest_rng.integers(TRAIN_END)) for _ in count())
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)
@@ -180,7 +180,7 @@ class Run:
         scores = [(row[share], row["validation_progress"]) for row in self.log]
         if averaged or scores[-1] > max(scores[:-1], default=(-1, 0)):
             save_weights(self.folder / "best.pt", q, self.c)
-        lines = [self.log[0], *(row.values() for row in self.log)]  # at first the names
+        lines = [self.log[0].keys(), *(row.values() for row in self.log)]
         text = "".join(",".join(map(str, line)) + "\n" for line in lines)
         save(self.folder / "log.csv", text.encode())
         self.save()
@@ -232,7 +232,7 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
     seeds, film = range(args.first_seed, args.first_seed + args.episodes), args.out / "flight.gif"
     if not (0 < args.episodes <= 10**6 and args.first_seed >= 0 and 0 < args.threads <= 64):
         raise InputError("allowed: episodes 1 to 10^6, first-seed 0 or more, threads 1 to 64")
-    for path in (film, args.json or film):  # better to fail now than after all episodes
+    for path in {film, args.json or film}:  # better to fail now than after all episodes
         path.parent.mkdir(parents=True, exist_ok=True)
         path.open("ab").close()
     torch.set_num_threads(args.threads)

@@ -28,35 +28,33 @@ action only, and let all Q be 0 at first. Each update sets all three to their ta
 The truth moves backwards. Three things can go wrong, and DQN has an answer to each:
   * Steps that follow each other are alike (correlated samples), and a network that learns from them
     in that order forgets the rest. So a **replay** keeps transitions, and each update draws some at
-    random. Older agents made them, but y asks for the best action in s2 and not for the one that
-    was taken: Q-learning is off-policy. (With several rewards in a target nearly so, see `window`.)
+    random. Older, worse agents flew them, and yet they teach the best: y asks for the best action
+    in s2 and not for the one that was taken (Q-learning is off-policy; but see `window`).
   * Each update of Q also moves the targets. So they come from a **target network** Q^, a copy of Q
     that is synced only now and then.
   * An agent that always does what seems best never finds what is better. So it **explores**: with
     probability epsilon, at first 1 and later 0.05, its action is random (an exploration schedule).
 
-Algorithm 1 of [Mnih15]. `train` carries its line numbers:
-     1  initialize replay memory D to capacity N
-     2  initialize action-value function Q with random weights theta
-     3  initialize target action-value function Q^ with weights theta- = theta
-     4  for episode = 1, M do
-     5      initialize sequence s_1 = {x_1} and preprocessed sequence phi_1 = phi(s_1)
-     6      for t = 1, T do
-     7          with probability epsilon select a random action a_t
-     8          otherwise select a_t = argmax_a Q(phi(s_t), a; theta)
-     9          execute action a_t in emulator and observe reward r_t and image x_{t+1}
-    10          set s_{t+1} = s_t, a_t, x_{t+1} and preprocess phi_{t+1} = phi(s_{t+1})
-    11          store transition (phi_t, a_t, r_t, phi_{t+1}) in D
-    12          sample random minibatch of transitions (phi_j, a_j, r_j, phi_{j+1}) from D
-    13          set y_j = r_j if the episode terminates at step j+1,
-                    r_j + gamma * max_a' Q^(phi_{j+1}, a'; theta-) otherwise
-    14          perform a gradient descent step on (y_j - Q(phi_j, a_j; theta))^2 w.r.t. theta
-    15          every C steps reset Q^ = Q
+DQN for one environment, without what is marked [+] below:
 
-Legend: phi(s) last four frames, theta weights; A actions, B transitions in a batch, L environments
-side by side, T rows of the replay. A pass is one control step of all environments. [+name] marks
-what [Mnih15] does not have; the setting of that name switches it off. Three more are always on:
-Adam, bfloat16 where the processor knows it, and rewards that are not clipped to -1 .. 1.
+    s = the first observation of an episode
+    for each step:
+        a = a random action with probability epsilon, else the a of greatest Q(s, a)
+        s2, r, end = fly(a)
+        put s, a, r, s2, end into the replay
+        s = s2, or if the episode has ended the first observation of another one
+        every 4 steps:
+            b = 32 random transitions of the replay
+            y = b.r if b.end is TERMINAL else b.r + gamma * max Q^(b.s2, .)
+            loss = the mean of (y - Q(b.s, b.a))^2 / 2, straight lines beyond an error of 1
+            move the weights of Q a little against the gradient of the loss
+        every 2,000 steps:
+            Q^ = Q
+
+Legend: A actions, B transitions in a batch, L environments side by side (all E are active in
+training), T rows of the replay. A pass is one control step of all environments. [+name] marks what
+[Mnih15] does not have; the setting of that name switches it off. Three more are always on: Adam,
+bfloat16 where the processor knows it, and rewards that are not clipped to -1 .. 1.
 """
 
 import copy
@@ -105,9 +103,9 @@ class DQNConfig:
     double: bool = setting(True, "[+] Double DQN [van Hasselt 2016]; --no-double: off", 0, 1)
     n_steps: int = setting(5, "[+] true rewards in a target; 1: off", 1, 100)
     mirror: bool = setting(True, "[+] reflect half of every batch; --no-mirror: off", 0, 1)
-    huber_delta: float = setting(10.0, "[+] greater TD errors pull no harder; 1: Mnih's", 1e-3, 1e6)
+    huber_delta: float = setting(10.0, "[+] the hardest pull of a TD error; 1: Mnih's", 1e-3, 1e6)
     lr_final: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
-    swa_fraction: float = setting(0.1, "[+] last share, whose weights are averaged; 0: off", 0, 0.5)
+    swa_fraction: float = setting(0.1, "[+] last share of steps, weights averaged; 0: off", 0, 0.5)
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -127,7 +125,7 @@ class QNetwork(nn.Module):
     Each number that leaves a layer is a weighted sum of numbers that enter it, plus a constant, its
     bias: inputs 2 and -1, weights 3 and 4 and bias 1 make 3 * 2 + 4 * -1 + 1 = 3. In a linear layer
     every output sees all inputs. In a convolution it sees a small square, with the same few weights
-    in every place, a filter. A filter of two pixels with weights -1 and 1 makes 0 4 0 of the row
+    in every place: a filter. A filter of two pixels with weights -1 and 1 makes 0 4 0 of the row
     5 5 9 9: it finds the edge. Filters of 8x8 pixels that move on by 4 have (84 - 8) / 4 + 1 = 20
     places in a row of 84. ReLU turns negative numbers into 0; without it, two layers could do no
     more than one. The last layer has none, because values may be negative.
@@ -136,18 +134,18 @@ class QNetwork(nn.Module):
     def __init__(self, actions: int) -> None:
         super().__init__()
         self.conv = nn.Sequential(
-            *(nn.Conv2d(4, 32, 8, 4), nn.ReLU()),  # (B, 32, 20, 20): 4 frames, 32 filters of 8x8
-            *(nn.Conv2d(32, 64, 4, 2), nn.ReLU()),  # (B, 64, 9, 9)
-            *(nn.Conv2d(64, 64, 3, 1), nn.ReLU()),  # (B, 64, 7, 7)
+            nn.Conv2d(4, 32, 8, 4), nn.ReLU(),  # (B, 32, 20, 20): 4 frames, 32 filters of 8x8
+            nn.Conv2d(32, 64, 4, 2), nn.ReLU(),  # (B, 64, 9, 9)
+            nn.Conv2d(64, 64, 3, 1), nn.ReLU(),  # (B, 64, 7, 7)
             nn.Flatten(),  # (B, 3136)
-        )
+        )  # fmt: skip
         self.head = nn.Sequential(nn.Linear(3136, 512), nn.ReLU(), nn.Linear(512, actions))
 
     def forward(self, s: Tensor, bfloat16: bool = False) -> Tensor:
         """Q(s, .) (B, A) float32 of s (B, 4, 84, 84) uint8; PyTorch calls this for q(s).
 
         Near 100, where many values are, bfloat16 has steps of 0.5, and actions would tie. So the
-        last layers stay float32, and acting uses nothing else.
+        last layers stay float32, and acting is all in float32.
         """
         grey = s.to(torch.bfloat16 if bfloat16 else torch.float32).div_(255)  # (B, 4, 84, 84) 0..1
         with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
@@ -170,7 +168,7 @@ Batch = namedtuple("Batch", "s a r s2 gamma_n end")
 
 
 class Replay:
-    """The last transitions of L environments side by side (line 1).
+    """The last transitions of L environments side by side (line 1 of Algorithm 1, above `train`).
 
     Each frame is kept once, 7,056 bytes; s and s2 are put together when they are drawn. Keeping
     both whole would cost eight times as much. Row t, environment l holds the newest frame of s_t,
@@ -194,7 +192,7 @@ class Replay:
     """
 
     def __init__(self, capacity: int, num_envs: int) -> None:
-        shape = self.rows, self.num_envs = capacity // num_envs, num_envs  # T, L
+        self.rows, self.num_envs = shape = (capacity // num_envs, num_envs)  # T, L
         self.frames = np.empty((*shape, 84, 84), np.uint8)  # (T, L, 84, 84)
         self.actions, self.ends = np.zeros(shape, np.int64), np.zeros(shape, np.uint8)  # (T, L)
         self.rewards = np.zeros(shape, np.float32)  # (T, L)
@@ -326,8 +324,9 @@ def learn(agent: Agent, b: Batch, c: DQNConfig) -> None:
     would grow by 4 d and the loss would fall by 2.4 * 4 d = 9.6 d: the gradient is -9.6. With a
     learning rate of 0.01, w becomes 2 + 0.01 * 9.6 = 2.096, and Q 8.38.
 
-    PyTorch remembers how each tensor was made, so backward() can find the gradient of every weight,
-    and step() moves the weights. Under no_grad() it remembers nothing, so y is a constant.
+    A Tensor is an ndarray that remembers how it was made, so backward() can find the gradient of
+    every weight, and step() moves the weights. Under no_grad() it forgets, so y is a constant. A
+    Module is a function with weights, and state_dict() lists these by name.
 
     [+huber_delta] The Huber loss is half the error's square up to delta and a straight line beyond,
     so no error pulls harder than delta. Say that nine targets of ten are 0 and one is -10, a crash.
@@ -337,9 +336,9 @@ def learn(agent: Agent, b: Batch, c: DQNConfig) -> None:
     with torch.no_grad():
         q2 = agent.q_target(b.s2, BFLOAT16)  # (B, A)
         q2_online = agent.q(b.s2, BFLOAT16) if c.double else q2  # (B, A) [+double]
-        y = td_target(b, q2, q2_online)  # 13 (B,)
+        y = td_target(b, q2, q2_online)  # line 13 (B,)
     q_sa = agent.q(b.s, BFLOAT16).gather(1, b.a[:, None])[:, 0]  # (B,) Q of the actions taken
-    loss = nn.functional.huber_loss(q_sa, y, delta=c.huber_delta)  # 14 [+huber_delta]
+    loss = nn.functional.huber_loss(q_sa, y, delta=c.huber_delta)  # line 14 [+huber_delta]
     agent.optimizer.zero_grad()  # backward() adds to what is there
     loss.backward()
     agent.optimizer.step()
@@ -365,21 +364,23 @@ def due(every: int, step: int, num_envs: int) -> int:
     return step // every - (step - num_envs) // every
 
 
-# Textbook DQN for one environment, without what is marked [+]:
-#
-#     s = the first observation of an episode
-#     for each step:
-#         a = a random action with probability epsilon, else the a of greatest Q(s, a)
-#         s2, r, end = fly(a)
-#         put s, a, r, s2, end into the replay
-#         s = s2, or if the episode has ended the first observation of another one
-#         every 4 steps:
-#             b = 32 random transitions of the replay
-#             y = b.r if b.end is TERMINAL else b.r + gamma * max Q^(b.s2, .)
-#             loss = the mean of (y - Q(b.s, b.a))^2 / 2, straight lines beyond an error of 1
-#             move the weights of Q a little against the gradient of the loss
-#         every 2,000 steps:
-#             Q^ = Q
+# Algorithm 1 of [Mnih15]; phi(s): the last four frames, theta: the weights.
+#      1  initialize replay memory D to capacity N
+#      2  initialize action-value function Q with random weights theta
+#      3  initialize target action-value function Q^ with weights theta- = theta
+#      4  for episode = 1, M do
+#      5      initialize sequence s_1 = {x_1} and preprocessed sequence phi_1 = phi(s_1)
+#      6      for t = 1, T do
+#      7          with probability epsilon select a random action a_t
+#      8          otherwise select a_t = argmax_a Q(phi(s_t), a; theta)
+#      9          execute action a_t in emulator and observe reward r_t and image x_{t+1}
+#     10          set s_{t+1} = s_t, a_t, x_{t+1} and preprocess phi_{t+1} = phi(s_{t+1})
+#     11          store transition (phi_t, a_t, r_t, phi_{t+1}) in D
+#     12          sample random minibatch of transitions (phi_j, a_j, r_j, phi_{j+1}) from D
+#     13          set y_j = r_j if the episode terminates at step j+1,
+#                     r_j + gamma * max_a' Q^(phi_{j+1}, a'; theta-) otherwise
+#     14          perform a gradient descent step on (y_j - Q(phi_j, a_j; theta))^2 w.r.t. theta
+#     15          every C steps reset Q^ = Q
 
 
 def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator[tuple]:

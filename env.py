@@ -44,8 +44,7 @@ Legend
     d_obs     m, from the drone's centre to the nearest trunk's surface, at most a laser's range
     d_goal    m, from the drone's centre to the goal
     d_max     m, the forest's length
-    psi       rad, the heading
-    N         trunks
+    psi, N    the heading in rad, trunks
     E         active drones: those whose episodes have not ended
     [DF]      the Deep Flight paper; "authors' simulator" is the code released with it
     ours      a number that neither gives
@@ -70,7 +69,7 @@ Episode = dict  # what Drone.episode returns
 
 @dataclass(frozen=True)
 class World(Scene):
-    """The forest, the drone and the rules, in SI units. `Scene` adds the length and all looks."""
+    """Forest, drone and rules, in SI units; the length and all looks are inherited from Scene."""
 
     width: float = 50.0  # m; this and all down to jitter: authors' simulator
     back: float = 2.0  # m, how far the drone may retreat behind the start
@@ -95,9 +94,8 @@ class World(Scene):
 def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
     """The reward of one step, [DF §II-A] line by line.
 
-    outcome: "" in the air, else one of OUTCOMES. d_obs, d_goal: m. The paper prints the
-    inequality of r_near in reverse, which we correct. The authors' simulator computes r_goal
-    and forgets to add it; we add it, as the paper says.
+    outcome: "" in the air, else one of OUTCOMES. d_obs, d_goal: m. We correct two slips: the paper
+    has r_near's inequality reversed, and the authors' simulator forgets to add r_goal.
 
     >>> reward("", 3.0, 45.0, World()), reward("", 0.75, 90.0, World())
     (0.75, -5.0)
@@ -130,10 +128,10 @@ class Drone:
     """
 
     def __init__(self, world: World) -> None:
-        self.world, self.outcome = world, "not reset"  # so no episode is active
+        self.world, self.outcome = world, "not reset"  # anything but "": no episode is active
         self.space, self.body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-        ground, trunks = self.space.static_body, math.prod(world.grid)
-        self.shapes = [pymunk.Circle(ground, world.trunk_radius) for _ in range(trunks)]
+        fixed, count = self.space.static_body, math.prod(world.grid)
+        self.shapes = [pymunk.Circle(fixed, world.trunk_radius) for _ in range(count)]
         self.space.add(self.body, *self.shapes)
 
     def reset(self, seed: int) -> None:
@@ -168,8 +166,8 @@ class Drone:
         return r
 
     def sense(self) -> None:
-        """Measure where the drone is (pose: x, y in m and heading in rad), how much x it gained in
-        this step (forward, m), its largest x so far (progress, m), d_obs and d_goal; then look."""
+        """Measure pose (x, y in m, heading in rad), forward (m of x in this step), progress (m, the
+        largest x so far), d_obs and d_goal; then look."""
         (x, y), x_before = self.body.position, self.pose[0]
         self.pose = (x, y, self.body.angle)
         self.forward, self.progress = x - x_before, max(self.progress, x)
@@ -181,12 +179,12 @@ class Drone:
         self.observation = np.stack([*before, frame])  # (4, 84, 84)
 
     def judge(self) -> str:
-        """How the episode has ended: one of OUTCOMES, tested in their order, or "" in the air."""
+        """How the episode has ended: the first of OUTCOMES that holds, or "" in the air."""
         (x, y, _), world = self.pose, self.world
         ended = {"crash": self.d_obs < world.d_crash, "goal": self.d_goal < world.goal_radius,
                  "far": x > world.length, "back": x < -world.back, "side": abs(y) > world.width / 2,
                  "time": len(self.actions) >= world.max_steps}  # fmt: skip
-        return next((outcome for outcome in OUTCOMES if ended[outcome]), "")
+        return next((outcome for outcome, holds in ended.items() if holds), "")
 
     def episode(self) -> Episode:
         """The episode so far: seed, actions as one digit each, and what came of them."""
@@ -224,7 +222,8 @@ class VecForest:
     def step(self, actions: Iterable[int]) -> tuple:
         """One control step of the active drones; actions: one for each, in order.
 
-        Returns observations (E, 4, 84, 84), rewards (E,), terminated (E,), truncated (E,), drones.
+        Returns the new observations (E, 4, 84, 84), rewards (E,), terminated (E,), truncated (E,),
+        and these drones, because `active` has lost those that ended.
         """
         drones = self.active
         r = np.array([drone.step(a) for drone, a in zip(drones, actions, strict=True)])  # (E,)

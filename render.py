@@ -44,10 +44,9 @@ and light do. So a pilot that learns from disparity in one forest should fly in 
 different [DF §IV].
 
 Legend
-    N     trunks
-    M     rays
+    N, M  trunks, rays
     grey  0 is black, 255 is white
-    [DF]  the Deep Flight paper; "ours" marks a number that no source gives
+    [DF]  the Deep Flight paper; "authors' simulator": its code; "ours": a number of neither
 
 Not in this file: textures, shadows, leaning trunks, a drone that climbs.
 """
@@ -63,8 +62,8 @@ from numpy import ndarray
 from PIL import Image, ImageDraw
 
 PIXELS = 84  # height and width of a frame [DF §II-A]
-# (84,) (41.5 - i) / 42: of column i, positive left; of row i, up. 45 degrees to each side (ours).
-SLOPES = (PIXELS - 1 - 2 * np.arange(PIXELS)) / PIXELS
+# (84,) (41.5 - i) / 42 of column i, to the left, or of row i, up: 45 degrees to each side (ours).
+SLOPES = ((PIXELS - 1) / 2 - np.arange(PIXELS)) / (PIXELS / 2)
 BEARINGS = np.arctan(SLOPES)  # (84,) rad, counter-clockwise from straight ahead
 COSINES = np.cos(BEARINGS)  # (84,) depth for each metre along a ray
 CAMERAS = ("grey", "disparity")  # what a pixel may say
@@ -109,16 +108,17 @@ def raycast(centres: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray
     half_chord = np.sqrt(np.where(hit, radius**2 - across**2, 0.0))  # (N, M) m
     distance = np.where(hit, along - half_chord, np.inf)  # (N, M) m
     nearest = distance.min(0, initial=np.inf)  # (M,) m
-    return nearest, np.where(distance == nearest, half_chord, 0.0).max(0, initial=0.0) / radius
+    half_chord[distance > nearest] = 0.0  # only that of the nearest trunk is left
+    return nearest, half_chord.max(0, initial=0.0) / radius
 
 
 def shade(grey: ndarray | float, air: ndarray | float, depth: ndarray, scene: Scene) -> ndarray:
     """The value of a pixel, 0 to 255. depth: m, of what it shows.
 
-    air: m in front of it, or 0 for the beacon, which always looks clear. The grey camera mixes a
+    air: m of air before it, or 0 for the beacon, which always looks clear. The grey camera mixes a
     grey level with the sky's: the more air, the more sky, and nothing else where the view ends. A
-    stereo camera has two lenses side by side, which see a point in columns that differ by focal
-    length * baseline / depth. That is the disparity; 255 * near stands for focal length * baseline.
+    stereo camera has two lenses, a baseline apart, which see a point in columns that differ by
+    focal length * baseline / depth: the disparity. 255 * near stands for focal length * baseline.
 
     >>> shade(0, 0, np.array([1.0, 2.0, 4.0, np.inf]), Scene(camera="disparity"))
     array([255. , 255. , 127.5,   0. ])
@@ -139,7 +139,7 @@ def background(scene: Scene) -> ndarray:
 def paint(frame: ndarray, depth: ndarray, height: float, value: ndarray, scene: Scene) -> ndarray:
     """The frame, a column (84, 1) or (84, 84), with upright cylinders drawn over it: (84, 84).
     depth (84,): m, of their surface, inf where there is none. value (84,): of their pixels."""
-    foot, top = (h / depth for h in (-scene.altitude, height - scene.altitude))  # (84,) slopes
+    foot, top = -scene.altitude / depth, (height - scene.altitude) / depth  # (84,) slopes, 0 at inf
     inside = (SLOPES[:, None] > foot) & (SLOPES[:, None] <= top)  # (84, 84)
     return np.where(inside, value.astype(np.uint8), frame)
 
