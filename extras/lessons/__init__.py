@@ -11,15 +11,16 @@ import dqn
 
 
 def recipe(name: str, config: type, **changes: Any) -> type:
-    """A configuration like `config`. A change is another default of a setting, a setting of its
-    own, which dqn.setting makes, or else a class variable.
+    """A configuration like `config`. A change is a new default of a known setting, a new setting
+    (made by dqn.setting), or else a class variable.
 
     >>> loud = dqn.setting(False, "say more", 0, 1)
     >>> Short = recipe("Short", deepflight.Config, steps=1_000, loud=loud, pilot="short")
     >>> Short().steps, Short(steps=2_000).steps, Short().gamma, Short().loud, Short.pilot
     (1000, 2000, 0.99, False, 'short')
     """
-    known, settings, variables = {f.name: f for f in fields(config)}, [], {}
+    known = {f.name: f for f in fields(config)}
+    settings, variables = [], {}
     for key, value in changes.items():
         if key in known:
             default = field(default=value, metadata=known[key].metadata)

@@ -17,43 +17,42 @@ becomes a transition with frames and rewards like any other. (--first-seed 0 abo
 that teaches cannot test.)
 
 **The idea** is that of [Hester 2018], DQfD. A transition says what reward followed, and the TD loss
-learns that. But nobody tried the other eight actions, so nothing holds their Q down: the maximum in
-the TD target may then take an action that is overestimated and was never flown. A demonstration
+learns that. But nobody tried the other eight actions, so nothing corrects their Q, and the maximum
+in the TD target may take one that is too high. A demonstration
 says one thing more, that somebody who saw s chose a. So Q(s, a) should be the greatest of the nine,
 by a margin, 5. The large-margin loss is how far it falls short of that:
 
     max over b of (Q(s, b) + m)  -  Q(s, a)        m is 0 where b = a, and otherwise 5
 
-In numbers: let Q be 1, 9 and 0, and let the first action be the demonstrated one. With the margin
-the others count as 14 and 5, so the loss is 14 - 1 = 13. It pulls the 9 down and the 1 up. If the
+In numbers: let Q be 1, 9 and 0, and let the first action be the demonstrated one. Plus 5 the others
+are 14 and 5, so the loss is 14 - 1 = 13. It pulls the 9 down and the 1 up. If the
 second one was demonstrated, the others count as 6 and 5, 9 is more, and the loss is 0.
 
 The network learns from the demonstrations alone at first, in 2,000 updates. Then it flies, and
 because it need not begin by chance, epsilon is 0.05 from the start. Its next update comes after
-5,000 steps. With --demo-share 0.25 a quarter of every later batch are demonstrations too, as in
-DQfD.
+5,000 steps. With --demo-share 0.25 a quarter of every later batch is demonstrations, as in DQfD.
 
 **What is different from dqn.py**, marked [!] in `train`:
-    demo_replay   a replay of their own for the demonstrations, which no step of ours overwrites
+    demo_replay   a second replay, for demonstrations alone
     pretrain      updates on demonstrations alone, before the first step
-    sample        a batch may hold demonstrations, and says which of its transitions are some
+    sample        a batch may hold demonstrations, and says which transitions are
     learn         the TD loss, and on demonstrations the large-margin loss
 
 **What came out**, seed 0 and seed 1. The first line is over 1,000 test forests (README.md), and the
 others, from trainings of an earlier version, over 200 (results/demonstrations.json):
 
                                         crossed    hit a trunk    return
-    32 episodes and --steps 80          16, 0 %    19, 16 %       16, -12
-    and 60,000 steps                    72, 55 %   4.5, 15.5 %    32, 20
-    dqn after 60,000 steps              43, 60 %   1.5, 9.5 %     26, 12
-    with --demo-share 0.25              35, 27 %   34, 52.5 %     43, 43
-    and with --epsilon-decay 40000      22, 16 %   1, 0.5 %       31, 27
+    32 episodes alone (--steps 80)      16, 0 %    19, 16 %       16, -12
+    32 episodes, then 60,000 steps      72, 55 %   4.5, 15.5 %    32, 20
+    dqn, 60,000 steps                   43, 60 %   1.5, 9.5 %     26, 12
+    32, 60,000, --demo-share 0.25       35, 27 %   34, 52.5 %     43, 43
+    the same, --epsilon-decay 40000     22, 16 %   1, 0.5 %       31, 27
 
-80 steps are too few for an update, so the pilots of the first line learned from nothing else. They
-fly 338 and 191 % longer than random, as dqn does after 10,000 steps or two minutes. What is left of
-this after 60,000 steps lies within the spread of seeds. Demonstrations in later batches raised the
-return, and crashes with it. Our explanation: demonstrated episodes do not crash, and a drone that
-explores little besides has seen too few crashes to know when one is coming.
+In 80 steps no update is due, so the first line is what the 2,000 updates on demonstrations make.
+Its pilots fly 338 and 191 % longer than random, as dqn does after 10,000 steps. After 60,000 steps
+the lead is no larger than the spread of seeds. Demonstrations in later batches raised the return,
+and crashes with it. Our explanation: demonstrated episodes do not crash, and a drone that explores
+little besides has seen too few crashes to know when one is coming.
 
 [Hester 2018]  Deep Q-learning from demonstrations, AAAI; it also has a prioritized replay
 """
@@ -116,7 +115,7 @@ def load_demos(demos: list[Episode], c: "DemoConfig", world: World, shaped: Call
 def sample(
     replay: Replay, demo_replay: Replay, share: float, c: "DemoConfig", rng: Generator
 ) -> DemoBatch:
-    """A batch of which this share are demonstrations."""
+    """A batch with this share of demonstrations."""
     n_demos = round(share * c.batch_size)
     parts = [(replay, c.batch_size - n_demos), (demo_replay, n_demos)]
     drawn = [part.sample(n, c.n_steps, c.gamma, rng) for part, n in parts if n]
@@ -194,7 +193,7 @@ DemoConfig = recipe(
     "DemoConfig", Config,
     command="-m extras.lessons.demonstrations", pilot="demonstrations",
     train=staticmethod(train), baselines=Config.baselines | {"laser": laser_pilot(Config.gamma)},
-    epsilon_decay=1,
+    epsilon_decay=1,  # epsilon_final from the start
     demos=setting("", "file of episodes that eval --json wrote, or the cockpit"),
     demo_pilot=setting("laser", "whose episodes of that file are the demonstrations"),
     demo_updates=setting(2_000, "updates on demonstrations alone, at first", 1, 10**7),

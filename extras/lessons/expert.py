@@ -10,11 +10,11 @@ already. How well can a network fly that learns from this expert and not from re
 
 **The expert** is a planner, `plan`. It has a laser scanner and knows its pose, so it is privileged:
 the network has four frames and nothing else. It adds up the rewards to come along 81 candidate
-trajectories. Each is one of the nine yaw rates for 0.6 s, then one for 1.6 s, and it ends early
+trajectories. Each holds one yaw rate for 0.6 s, then another or the same for 1.6 s. It ends early
 where it crashes, leaves the forest or arrives. The reward of step k counts gamma^k times. Where a
-trajectory does not end early, more is to come. So the planner adds gamma^n times a bonus, that of
-the goal or of the far edge, whichever makes more. n are the steps of a turn and a straight flight
-there, as if no trunk stood in the way and no step earned anything. An action is worth what the best
+trajectory does not end early, `plan` pretends that the drone then turns to the goal or to the far
+edge and flies straight there, through all trunks and without rewards, for its bonus: gamma^n times
+it, where n steps lead from now to there. The better one is added. An action is worth what the best
 trajectory is worth that begins with it. These nine values are the scores.
 
 In numbers, where arrival is worth 125 and no other bonus is paid: fly straight on from the start,
@@ -22,8 +22,8 @@ far from trunks. The 22 steps earn 6.2. The goal is then 79 m or 158 steps away,
 0.99^(22 + 158) * 125 = 20.5 more are added, and the value is 26.7.
 
 **Imitation learning.** Each observation that the drones meet comes with the expert's nine scores as
-labels, so no label is bootstrapped. The expert's share of the actions falls from 1 to 0 within
-15,000 steps, and then the network flies alone. Why not let the expert fly all the time? Because a
+labels, so no label is bootstrapped. The expert's share of the actions, epsilon, falls from 1 to 0
+in 15,000 steps, and then the network flies alone. Why not let the expert fly all the time? A
 network errs a little, and its errors take it to places where the expert never was. It would have no
 labels there. In its own episodes it has them [Ross 2011, DAgger].
 
@@ -34,7 +34,7 @@ less. So it turns.
 
 Its nine outputs are not Q. From scores and outputs we subtract their mean over the actions: 26, 24
 and 19 become 3, 1 and -4. These are advantages: how much better an action is than the others,
-whatever the observation is worth. The level of the outputs means nothing, but with --bellman.
+whatever the observation is worth. Only with --bellman does the level of the outputs mean anything.
 
 **What is different from dqn.py**, marked [!] in `train`:
     consult, ExpertReplay  the expert scores each observation, and the replay keeps the scores
@@ -49,7 +49,7 @@ whatever the observation is worth. The level of the outputs means nothing, but w
     dqn                     65.6 %       2.0 %       64.4
     imitation, seed 0       88.5 %       0.3 %       83.7
     imitation, seed 1       87.2 %       0.3 %       84.1
-    the planner             98.9 %       0.0 %       88.7      for arrival, without other bonuses
+    the planner             98.9 %       0.0 %       88.7      (plans for arrival only)
 
 With the beacon 90.3 % arrive, at a return of 88.3 (dqn: 90.6 % at 56.9). TD targets beside the
 scores made it worse: after 60,000 steps 53.5 and 54.5 % of 200 crossed, without them 72.5 and
@@ -168,8 +168,8 @@ ExpertBatch = namedtuple("ExpertBatch", (*dqn.Batch._fields, "scores"))
 
 def consult(envs: VecForest, c: Config) -> None:
     """Let `envs.reset_done` also keep, in `envs.scores` (L, A), what the expert says of the
-    observations that it returns. A resumed training, which flies all its actions again, calls it
-    before every step too, so it gets the same scores."""
+    observations that it returns. Resuming calls it before each step too, so the scores come out
+    the same."""
     reset_done = envs.reset_done
 
     def reset_and_score() -> ndarray:
@@ -250,7 +250,7 @@ def train(c: "ExpertConfig", envs: VecForest, rng: Generator, shaped: Callable) 
         agent.optimizer.param_groups[0]["lr"] = lr
         s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
-        rng.integers(envs.num_actions, size=c.num_envs)  # [!] not flown
+        rng.integers(envs.num_actions, size=c.num_envs)  # [!] drawn as in dqn.py, but not flown
         best = envs.scores.argmax(1)  # (L,) [!]
         a = np.where(explore, best, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,) [!]
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10

@@ -1,18 +1,18 @@
 """looks.py: other light, other bark. How does a pilot fly where the world looks different? [DF §IV]
 
     python -m extras.lessons.looks train --name looks-grey
-                                              imitation, with a random look in each forest
+                                              grey camera, a random look in each forest
     python -m extras.lessons.looks train --camera disparity --name looks-disparity
-                                              the same with the errors of a stereo camera
+                                              disparity camera, random errors
     python -m extras.lessons.looks eval --weights runs/looks-disparity/best.pt
     python -m extras.lessons.looks fly        four pilots in every look: results/transfer.json
 
 A training takes about an hour, and `fly` half an hour. `eval` flies in the plain look.
 figures/transfer.png, which extras/experiments/figures.py draws, shows all looks.
 
-A network that learns from frames learns everything that helps, and so also what is true only in its
-training: that bark is darker than the sky, say. In another forest this misleads it, although no
-trunk stands elsewhere. There are two remedies.
+**The question.** A network that learns from frames learns everything that helps, and so also what
+is true only in its training: that bark is darker than the sky, say. In another forest this misleads
+it, although no trunk stands elsewhere. There are two remedies.
 
 **Disparity** leaves out of the frame what must not matter. It is what a stereo camera measures: by
 how many pixels a point is shifted between the left and the right picture. That depends on geometry
@@ -26,26 +26,26 @@ of disparity it is 510 / 8.5 = 60 in both forests.
 A real stereo camera makes errors of its own. It must find each point of the left picture in the
 right one, and on a trunk of one colour it can find only the two edges. Take a pair of pictures 640
 pixels wide, whose lenses stand 12 cm apart. Its focal length is 320 pixels, so the shift is 320 *
-0.12 / 8.5 = 4.5 pixels. If it can tell whole pixels apart only, it says 4, rounded down. A pixel is
-13 of our levels, so the frame says 52 in place of 60.
+0.12 / 8.5 = 4.5 pixels. Measured in whole pixels, rounded down, it is 4. A pixel is 510 / (320 *
+0.12) = 13 levels of our frame, which says 52 in place of 60.
 
 **Domain randomization** lets what must not matter vary in the training, so that nothing can be
-learnt from it [Tobin 2017]. Each forest gets a look at random, from ranges that hold all looks in
-which we test. (For disparity haze does not vary.) The forest determines the look, and forest and
+learnt from it [Tobin 2017]. Each forest gets a random look, from ranges that include all tested
+looks. (Haze is not varied for disparity.) The forest determines the look, and forest and
 pose determine the noise. So an episode is still determined by its seed and its actions, and an
 interrupted training can go on.
 
-What differs from expert.py
+**What differs from expert.py**
     env.draw_frame   while `train` runs, `wear_at_random` stands in its place
 The network, the loss, the planner and the loop are the same.
 
-What came out, in 200 forests (results/transfer.json)
+**What came out** in 200 forests (results/transfer.json)
     * The grey pilot crosses 87 % in the world of its training, and 0 % where bark is bright or
       striped, or at dusk. Trained with random looks it crosses 70 to 83 % in every look, and 77 %
       in the plain world.
     * The disparity pilot crosses 86.5 %, whatever the paint and the light. With all errors of a
       stereo camera together it crosses 66.5 %, and 86 % if it was trained with random errors.
-      So of these a real drone should get that one.
+      Of the four pilots a real drone should get this last one.
 
 Legend
     level a step of a frame's 0 to 255
@@ -91,7 +91,7 @@ class Look:
     holes: float = 0.0  # the share of 4x4 blocks in a trunk where the camera finds no depth
     filled: bool = False  # a hole gets the last depth to its left, and not 0
     quantum: int = 1  # levels between two depths that the camera can tell apart
-    fat: int = 0  # px by which an edge is too far to the right, and twice that to the left
+    fat: int = 0  # px by which a trunk is too wide on its right, and twice that on its left
 
 
 PLAIN, NO_HAZE, THICK_HAZE = Look(), Look({"view": 1000.0}), Look({"view": 15.0})
@@ -133,7 +133,7 @@ def wear(look: Look, pose: Sequence[float], trunks: ndarray, scene: Scene) -> nd
             frame, draw_frame(pose, trunks, replace(scene, camera="disparity")), look, scene
         )
     change = mismatch if scene.camera == "disparity" else expose
-    # Seeded by the bits of these numbers: as whole numbers, without the sign of zero.
+    # The same noise for the same pose and forest. Without abs, 0.0 and -0.0 would differ.
     rng = np.random.default_rng(np.abs([*pose, *trunks[0]]).view(np.uint32))
     changed = change(frame.astype(float), look, scene, rng)  # (84, 84)
     return np.clip(np.rint(changed), 0, 255).astype(np.uint8)
@@ -160,7 +160,7 @@ def expose(frame: ndarray, look: Look, _scene: Scene, rng: Generator) -> ndarray
 
 def mismatch(frame: ndarray, look: Look, scene: Scene, rng: Generator) -> ndarray:
     """What a stereo camera gets wrong in a frame of disparity (84, 84)."""
-    if look.fat:  # a pixel shows the nearest of those from 2 * fat on its right to fat on its left
+    if look.fat:  # each pixel shows the nearest point from fat to its left to 2 * fat to its right
         padded = np.pad(frame, ((0, 0), (look.fat, 2 * look.fat)))
         shifted = [padded[:, i : i + PIXELS] for i in range(3 * look.fat + 1)]
         frame = np.maximum.reduce(shifted)  # (84, 84)
@@ -169,7 +169,9 @@ def mismatch(frame: ndarray, look: Look, scene: Scene, rng: Generator) -> ndarra
         inside = trunk & np.roll(trunk, 1, 1) & np.roll(trunk, -1, 1)  # (84, 84) not the two edges
         blocks = rng.random((21, 21)) < look.holes
         hole = inside & np.kron(blocks, np.ones((4, 4), bool))  # (84, 84)
-        last = np.maximum.accumulate(np.where(hole, 0, np.arange(84)), 1)  # (84, 84) column
+        last = np.maximum.accumulate(
+            np.where(hole, 0, np.arange(84)), 1
+        )  # (84, 84) the last column without a hole
         filled = np.take_along_axis(frame, last, 1)  # (84, 84)
         frame = filled if look.filled else np.where(hole, 0, frame)
     frame = frame + look.error * rng.standard_normal(frame.shape, np.float32) * (frame > 0)
@@ -208,7 +210,7 @@ def random_look(camera: str, rng: Generator) -> Look:
 
 
 def wear_at_random(pose: Sequence[float], trunks: ndarray, scene: Scene) -> ndarray:
-    """What a drone sees that wears the look of its forest: (84, 84) uint8."""
+    """What a drone sees in the look of its forest: (84, 84) uint8."""
     rng = np.random.default_rng(np.abs(trunks[0]).view(np.uint32))  # the same in each step
     return wear(random_look(scene.camera, rng), pose, trunks, scene)
 

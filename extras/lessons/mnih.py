@@ -1,14 +1,13 @@
 """mnih.py: the optimizer and the settings of [Mnih15], Nature 518, Extended Data Table 1.
 
-    python -m extras.lessons.mnih train   his settings; 1.4 million steps as in the paper, 8 GB, and
-                                          hours: 3 in the training below
+    python -m extras.lessons.mnih train   his settings: 1.4 million steps as in [DF], 8 GB, hours
     python -m extras.lessons.mnih textbook train --steps 100000
-                                          dqn.py, without all that is marked [+] but num_envs
+                                          dqn.py with all [+] off except num_envs
     python -m extras.lessons.mnih eval --weights runs/NAME/best.pt
     python -m extras.lessons.mnih diff             its loop beside that of dqn.py
 
 **The question.** [DF] says that its algorithm is the one "proposed by Mnih et al.", and dqn.py adds
-pieces to it, marked [+]. What does Mnih's own recipe learn in this forest, in the paper's time?
+pieces to it, marked [+]. What does Mnih's own recipe learn here, in [DF]'s 1.4 million steps?
 
 **His RMSprop** moves a weight with gradient g by -lr * g / sqrt(variance + epsilon), where the
 variance is the running mean of g^2 less the square of the running mean of g. A running mean goes
@@ -27,7 +26,8 @@ each move adds 0.95 of the one before, up to 20 times as much if all go in one d
                      that is straight beyond errors of 1, a constant rate, no mean of the weights,
                      no shaped reward
     MnihConfig       the same with his numbers: a replay of a million transitions, a sync every
-                     10,000 steps, epsilon from 1 to 0.1 in a million steps
+                     10,000 steps, epsilon from 1 to 0.1 in a million steps, and the
+                     first update after 50,000 steps
 Left as they are: eight environments side by side, which only saves time, and rewards that are not
 cut to [-1, 1], because a crash (-10) would then count no more than a near trunk (down to -5).
 

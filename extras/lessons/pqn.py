@@ -14,7 +14,7 @@ from Q itself, as it was when the rollout began.
 **The lambda-return.** A rollout is in order, so a target may look further than one step. After
 (s, a, r, s2) it can go on with the return that was flown from s2, or with the greatest Q(s2, .), an
 estimate. The flown return is true for one flight only, so it is noisy; the estimate is steady but
-at first wrong. The lambda-return G takes a share of both at every step, and is computed backwards:
+at first wrong. The lambda-return G mixes both at every step, and is computed backwards:
 
     G_t = r_t + gamma * ((1 - lambda) * max Q(s2_t, .) + lambda * G_(t+1))
 
@@ -35,19 +35,17 @@ standard deviation: 1, 3, 8 become -1.0, -0.3, 1.4, and 10, 30, 80 become the sa
 by making its features larger. Under some conditions this is proven to be stable [Gallici 2025].
 
 **What differs from dqn.py**
-    network         a normalization before each ReLU
-    replay          no memory, but a rollout that is thrown away
-    learn           lambda-returns instead of n-step targets; two passes over the rollout
-    target network  none, so no sync and no Double DQN
-    optimizer       RAdam, which is Adam with short first steps
-    train           learns after each rollout, not in each pass
-    settings        500,000 steps, 1 for a metre and 115 for the far edge, see PQNConfig
+    network    a normalization before each ReLU; no target network, so no Double DQN
+    replay     a rollout that is thrown away; `train` learns when it is full, not in each pass
+    learn      lambda-returns instead of n-step targets; two passes over the rollout
+    optimizer  RAdam, which is Adam with short first steps
+    settings   500,000 steps, 1 for a metre and 115 for the far edge, see PQNConfig
 
 **Why it is quick.** DQN learns from each step eight times (32 transitions every 4 steps). Each time
-it makes three passes forward, for s and twice for s2, and one backward, which costs as much as two:
+it makes three passes forward, Q(s), Q(s2) and Q^(s2), and one backward, which costs as much as two:
 8 * (3 + 2) = 40 for each step flown. PQN makes 2 * (1 + 2) and one for max Q(s2, .), 7 in all. But
-it throws away what it could learn from again. In a slow world, as with a real drone that flies ten
-steps a second, steps are dear and multiplications cheap, so there a replay is the better idea.
+it throws away what it could learn from again. In a slow world, as with a real drone, steps are dear
+and multiplications cheap, so there a replay is the better idea.
 
 **What came out** over 1,000 test forests, with smaller bonuses than dqn's, which may explain part:
 
@@ -55,12 +53,11 @@ steps a second, steps are dear and multiplications cheap, so there a replay is t
     pqn           59.4, 56.6, 56.4   3.8, 16.9, 5.2    106, 102, 110   500,000   17, 16, 16
     dqn           65.6, 64.2, 66.9   2.0, 2.4, 1.6     64, 61, 54      200,000   45, 39, 41
 
-It is jumpy: of seed 0, from step 175,000 to 200,000, crashes went from 71 to 0 % of the validation
-episodes. Without normalization 31 % of these crossed after 150,000 steps, at a return of -4, and
-with it 58 % at 72 (results/pqn-plain, results/pqn).
+It is jumpy: 71 % of seed 0's validation episodes crashed at step 175,000, none at 200,000. After
+150,000 steps 58 % crossed with normalization and 31 % without (returns 72 and -4, one seed each),
+though the latter training ends there, its rate already low (results/pqn, results/pqn-plain).
 
-[Ba 2016] Layer normalization, arXiv:1607.06450. [Gallici 2025] Simplifying deep temporal difference
-learning, ICLR.
+[Ba 2016] arXiv:1607.06450. [Gallici 2025] Simplifying deep temporal difference learning, ICLR.
 """
 
 import sys
@@ -130,7 +127,7 @@ def lambda_returns(
     ended = terminated | truncated  # (T, L)
     g, returns = v2[-1], []  # (L,): nothing flown follows the last row
     for t in reversed(range(len(r))):
-        flown = torch.where(ended[t], v2[t], g)  # (L,) else G is of another episode
+        flown = torch.where(ended[t], v2[t], g)  # (L,) there g is of another episode
         g = r[t] + gamma * ((1 - lam) * v2[t] + lam * flown)  # (L,)
         returns.insert(0, g)
     return torch.stack(returns)
@@ -203,7 +200,7 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
         yield agent, rollout  # [!]
 
 
-# The settings of the replay, of the target network and of n-step targets have no effect here.
+# Without effect: replay_size, learning_starts, update_every, target_every, double and n_steps.
 PQNConfig = recipe(
     "PQNConfig", Config,
     command="-m extras.lessons.pqn", pilot="pqn", train=staticmethod(train),
