@@ -81,7 +81,7 @@ class Config(dqn.DQNConfig):
     train: ClassVar[Callable] = staticmethod(dqn.train)
     network: ClassVar[type] = QNetwork
     pilot: ClassVar[str] = "dqn"  # what the trained network is called
-    command: ClassVar[str] = f'"{__file__}"'  # what Python is told to run
+    program: ClassVar[str] = f'"{__file__}"'  # what Python is told to run
     baselines: ClassVar[dict[str, Pilot]] = {"straight": env.straight_pilot}
     validate_every: ClassVar[int] = 5_000  # control steps
     # With the beacon the goal can be seen, so arrival should be worth more than the far edge.
@@ -101,7 +101,7 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     goal_bonus: arrival ends the episode, and with it all rewards. To stay near the goal for ever
     would earn 1.25 + 0.99 * 1.25 + ... = 1.25 / (1 - 0.99) = 125 at most. So arrival earns as much:
     1.25 at once, and 125 as if in the next step, where it counts 0.99 times.
-    far_bonus: no frame shows which edge is the far one, so a drone that leaves does not know
+    far_bonus: the frames hardly show which edge is the far one, so a drone that leaves is not sure
     whether it gets -10 or 188. The bonus makes this risk worth taking; 200 was found by trial. It
     changes the task: the paper counts the far edge as a crash, and here it is worth more than
     arrival. So look at the share that arrived too, and not only at the share that crossed.
@@ -155,8 +155,8 @@ class Run:
                 if dqn.due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
                     self.validate(time.perf_counter() - began)
                 if stopped and envs.steps < c.steps:
-                    self.save()
-                    command = f'"{sys.executable}" {c.command} train --resume "{self.folder}"'
+                    self.save_checkpoint()
+                    command = f'"{sys.executable}" {c.program} train --resume "{self.folder}"'
                     print(f"saved at step {envs.steps:,}; to go on:\n{command}", file=sys.stderr)
                     return 128 + stopped[0]
         return 0
@@ -183,11 +183,11 @@ class Run:
         lines = [self.log[0].keys(), *(row.values() for row in self.log)]
         text = "".join(",".join(map(str, line)) + "\n" for line in lines)
         save(self.folder / "log.csv", text.encode())
-        self.save()
+        self.save_checkpoint()
         left = max(self.c.steps - envs.steps, 0) / speed / 60  # min
         print(ROW.format(**row, speed=speed, left=left), flush=True)
 
-    def save(self) -> None:
+    def save_checkpoint(self) -> None:
         """Write the checkpoint, 34 MB. Of the replay it holds the actions, one byte each."""
         content = {"config": asdict(self.c), "fingerprint": fingerprint(self.c), "log": self.log,
                    "actions": self.envs.history, "forests": self.forest_rng.bit_generator.state,
@@ -209,7 +209,7 @@ class Run:
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state, self.log = saved["rng"], saved["log"]
-        if saved["config"]["steps"] != self.c.steps:
+        if saved["config"]["steps"] != self.c.steps:  # lr too goes by the new length, so it rises
             self.agent.averaged.n_averaged.zero_()  # a longer training averages its own last share
 
 
@@ -375,7 +375,7 @@ def load_weights(path: Path | str, network: type = QNetwork) -> tuple[QNetwork, 
 
 def fingerprint(c: Config | type[Config]) -> list:
     """What must be the same where a training goes on, or its numbers would differ."""
-    return [c.pilot, str(torch.__version__), f"bfloat16 {dqn.BFLOAT16}"]
+    return [c.pilot, str(torch.__version__), f"bfloat16 {c.bfloat16}"]
 
 
 @contextmanager
@@ -421,8 +421,8 @@ def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespac
     return parser.parse_args(argv)
 
 
-def start(args: argparse.Namespace, config: type[Config]) -> Run:
-    """Begin a training, or go on with one."""
+def make_run(args: argparse.Namespace, config: type[Config]) -> Run:
+    """A new training, or one to go on with."""
     given = {f.name: x for f in fields(config) if (x := getattr(args, f.name)) is not None}
     if not args.resume:
         free = (f"{i:03d}" for i in count(1) if not Path(f"runs/{i:03d}").exists())
@@ -447,7 +447,7 @@ def main(argv: Sequence[str] | None = None, config: type[Config] = Config) -> in
     """Run one command; returns the exit code: 0, 2 after trouble, 128 + n after signal n."""
     args = parse(argv, config)
     try:
-        code = start(args, config).go() if args.command == "train" else evaluate(args, config)
+        code = make_run(args, config).go() if args.command == "train" else evaluate(args, config)
         sys.stdout.flush()  # here, so that a full disk is an error of ours
         return code
     except KeyboardInterrupt:

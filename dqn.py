@@ -61,7 +61,7 @@ import copy
 from collections import namedtuple
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -71,8 +71,6 @@ from torch import Tensor, nn
 
 # How a transition ended: not at all, by the time limit, or in the world itself (env.py tells more).
 LIVE, TRUNCATED, TERMINAL = range(3)
-# Numbers of half as many bits make convolutions quicker, on processors that know them.
-BFLOAT16 = bool(torch.cpu.get_capabilities().get("avx512_bf16"))
 
 
 class InputError(ValueError):
@@ -106,6 +104,8 @@ class DQNConfig:
     huber_delta: float = setting(10.0, "[+] the hardest pull of a TD error; 1: Mnih's", 1e-3, 1e6)
     lr_final: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
     swa_fraction: float = setting(0.1, "[+] last share of steps, weights averaged; 0: off", 0, 0.5)
+    # Half as many bits make convolutions quicker, on processors that know them. Mnih's lesson: off.
+    bfloat16: ClassVar[bool] = bool(torch.cpu.get_capabilities().get("avx512_bf16"))
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -282,10 +282,10 @@ class Agent(nn.Module):
     [+swa_fraction] Each update changes how Q flies, for better or worse. The mean of the weights
     over many updates is steadier (stochastic weight averaging), so it is what flies in the end.
 
-    Adam moves each weight by -lr * m / (sqrt(v) + eps), where m and v are running means of its
-    gradient g and of g^2, as in m = 0.9 * m + 0.1 * g. So all weights move about equally fast, but
-    for those with gradients below eps. Rainbow's eps is 1.5e-4 [Hessel 2018]. Ours is huber_delta
-    times that, because an error may pull huber_delta times as hard.
+    Adam moves each weight by -lr * m / (sqrt(v) + eps). m = 0.9 * m + 0.1 * g is a running mean of
+    its gradient g, and v of g^2, with 0.999 and 0.001 (both corrected for their start at 0). So all
+    weights move about equally fast, but for those with gradients below eps. Rainbow's eps is 1.5e-4
+    [Hessel 2018]. Ours is huber_delta times that: an error may pull huber_delta times as hard.
     """
 
     def __init__(self, c: DQNConfig, actions: int, rng: Generator) -> None:
@@ -334,10 +334,10 @@ def learn(agent: Agent, b: Batch, c: DQNConfig) -> None:
     balance one pull of 1: 9 * -Q = 1, so Q = -0.11, and the crash is nearly ignored.
     """
     with torch.no_grad():
-        q2 = agent.q_target(b.s2, BFLOAT16)  # (B, A)
-        q2_online = agent.q(b.s2, BFLOAT16) if c.double else q2  # (B, A) [+double]
+        q2 = agent.q_target(b.s2, c.bfloat16)  # (B, A)
+        q2_online = agent.q(b.s2, c.bfloat16) if c.double else q2  # (B, A) [+double]
         y = td_target(b, q2, q2_online)  # line 13 (B,)
-    q_sa = agent.q(b.s, BFLOAT16).gather(1, b.a[:, None])[:, 0]  # (B,) Q of the actions taken
+    q_sa = agent.q(b.s, c.bfloat16).gather(1, b.a[:, None])[:, 0]  # (B,) Q of the actions taken
     loss = nn.functional.huber_loss(q_sa, y, delta=c.huber_delta)  # line 14 [+huber_delta]
     agent.optimizer.zero_grad()  # backward() adds to what is there
     loss.backward()

@@ -34,8 +34,8 @@ only the clock ends it, after 1,000 steps: the drone was still flying, and more 
 followed. A learner must keep the two apart, or it takes the clock for a crash.
 
 The drone sees its last four frames, an **observation**. That is less than the whole state of the
-world: the frames do not show which edge of the forest is the far one, or what stands behind the
-next trunk. The world is partially observed.
+world: the frames hardly show which edge of the forest is the far one, and not what stands behind
+the next trunk. The world is partially observed.
 
 pymunk, a physics library, moves the drone and measures d_obs. An episode is a deterministic
 function of its seed and its actions, so these two are all it takes to fly it again.

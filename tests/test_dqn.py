@@ -171,7 +171,7 @@ def test_an_agent_is_a_function_of_its_seed_and_begins_with_two_equal_networks()
 
 @pytest.mark.parametrize("double", [True, False])
 def test_an_updates_loss_and_gradient_by_hand(double: bool, monkeypatch: MonkeyPatch) -> None:
-    monkeypatch.setattr(dqn, "BFLOAT16", False)
+    monkeypatch.setattr(DQNConfig, "bfloat16", False)
     c, b = DQNConfig(double=double, huber_delta=2.0), random_batch(16)
     one, loss, gradient, errors = agent(c), 0.0, np.zeros(9), []
     one.q_target.head[2].bias.data = torch.arange(9.0) % 5  # it would choose otherwise than Q

@@ -29,7 +29,7 @@ WORDS = [x for key, n in SMALL.items() for x in (f"--{key.replace('_', '-')}", s
 class Small(Config):
     """A training of seconds."""
 
-    command: ClassVar[str] = f'"{__file__}"'
+    program: ClassVar[str] = f'"{__file__}"'
     validate_every: ClassVar[int] = 200
 
 

@@ -109,7 +109,7 @@ def on_one_core() -> tuple[Given, Given]:
 
 def main() -> None:
     """Run it all, write it, print it."""
-    bfloat16 = dqn.BFLOAT16
+    bfloat16 = PLAIN.bfloat16
     (a, d), step, train = on_one_core(), "time of a step:", "training steps a second: ours"
     runners = {"sb3": sb3(), "ours": ours(False)} | ({"bfloat16": ours(True)} if bfloat16 else {})
     torch.set_num_threads(PLAIN.threads)

@@ -9,6 +9,7 @@ how many steps it has just done, and never ends. Not in this file: what the numb
 import os
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import asdict
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,10 +18,10 @@ import gymnasium
 import numpy as np
 import vizdoom
 
-import dqn
 from deepflight import Config, Run
 from env import VecForest, World
 from extras.bridges.sb3_train import make_model
+from extras.lessons import recipe
 
 REPLAY, DRONES = 20_000, 8  # transitions: Stable-Baselines3's take 1.1 GB; side by side
 PLAIN = Config(  # 1-step DQN, past exploration
@@ -87,9 +88,9 @@ def sb3() -> Iterator[int]:
 
 def ours(bfloat16: bool) -> Iterator[int]:
     """Our training, past its warm-up."""
-    run = Run(PLAIN, Path())  # it writes nothing there
+    config = recipe("Precise", Config, bfloat16=bfloat16)
+    run = Run(config(**asdict(PLAIN)), Path())  # it writes nothing there
     while True:
-        dqn.BFLOAT16 = bfloat16  # each time, because two trainings take turns
         next(run.loop)
         if run.envs.steps > PLAIN.learning_starts:
             yield DRONES

@@ -137,7 +137,7 @@ def margin_loss(q: Tensor, a: Tensor, margin: float) -> Tensor:
 
 def learn(agent: Agent, b: DemoBatch, c: "DemoConfig") -> None:
     """One update: lines 13 and 14, and the margin."""
-    q = agent.q(b.s, dqn.BFLOAT16)  # (B, A)
+    q = agent.q(b.s, c.bfloat16)  # (B, A)
     # Times huber_delta, so that a missed margin pulls as hard as the largest TD error.
     missed = c.huber_delta * b.is_demo * margin_loss(q, b.a, c.margin)  # (B,)
     loss = td_loss(agent, q, b, c) + missed.mean()
@@ -191,7 +191,7 @@ def train(c: "DemoConfig", envs: VecForest, rng: Generator, shaped: Callable) ->
 
 DemoConfig = recipe(
     "DemoConfig", Config,
-    command="-m extras.lessons.demonstrations", pilot="demonstrations",
+    program="-m extras.lessons.demonstrations", pilot="demonstrations",
     train=staticmethod(train), baselines=Config.baselines | {"laser": laser_pilot(Config.gamma)},
     epsilon_decay=1,  # epsilon_final from the start
     demos=setting("", "file of episodes that eval --json wrote, or the cockpit"),

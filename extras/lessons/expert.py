@@ -219,8 +219,8 @@ def imitation_loss(outputs: Tensor, scores: Tensor, delta: float) -> Tensor:
 def td_loss(agent: Agent, q: Tensor, b: dqn.Batch, c: Config) -> Tensor:
     """The loss of dqn.learn, where q (B, A) is Q(s, .)."""
     with torch.no_grad():
-        q2 = agent.q_target(b.s2, dqn.BFLOAT16)  # (B, A)
-        q2_online = agent.q(b.s2, dqn.BFLOAT16) if c.double else q2  # (B, A) [+double]
+        q2 = agent.q_target(b.s2, c.bfloat16)  # (B, A)
+        q2_online = agent.q(b.s2, c.bfloat16) if c.double else q2  # (B, A) [+double]
         y = td_target(b, q2, q2_online)  # 13 (B,)
     q_sa = q.gather(1, b.a[:, None])[:, 0]  # (B,) Q of the actions taken
     return nn.functional.huber_loss(q_sa, y, delta=c.huber_delta)  # 14 [+huber_delta]
@@ -228,7 +228,7 @@ def td_loss(agent: Agent, q: Tensor, b: dqn.Batch, c: Config) -> Tensor:
 
 def learn(agent: Agent, b: ExpertBatch, c: "ExpertConfig") -> None:
     """One update."""
-    q = agent.q(b.s, dqn.BFLOAT16)  # (B, A)
+    q = agent.q(b.s, c.bfloat16)  # (B, A)
     loss = td_loss(agent, q, b, c) if c.bellman else 0.0
     loss = loss + imitation_loss(q, b.scores, c.huber_delta)
     agent.optimizer.zero_grad()
@@ -272,7 +272,7 @@ def train(c: "ExpertConfig", envs: VecForest, rng: Generator, shaped: Callable) 
 # for a metre, its return is larger, but it crosses less often.
 ExpertConfig = recipe(
     "ExpertConfig", Config,
-    command="-m extras.lessons.expert", pilot="imitation", train=staticmethod(train),
+    program="-m extras.lessons.expert", pilot="imitation", train=staticmethod(train),
     baselines=Config.baselines | {"laser": laser_pilot(Config.gamma)}, validate_every=20_000,
     bellman=setting(False, "learn from TD targets too", 0, 1),
     learning_starts=500, epsilon_final=0.0, epsilon_decay=15_000, lr_final=0.0,

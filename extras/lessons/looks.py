@@ -225,7 +225,7 @@ def train(
 
 LooksConfig = recipe(
     "LooksConfig", ExpertConfig, pilot="looks", train=staticmethod(train),
-    command="-m extras.lessons.looks",
+    program="-m extras.lessons.looks",
 )  # fmt: skip
 
 

@@ -60,7 +60,6 @@ from numpy import ndarray
 from numpy.random import Generator
 from torch import Tensor, nn
 
-import dqn
 from deepflight import Config
 from dqn import linear_schedule
 from env import Drone, VecForest, World
@@ -138,7 +137,7 @@ def learn(agent: Agent, rollout: Rollout, c: Config, rng: Generator) -> None:
     s, a, r, s2, terminated, truncated, pose, pose2 = rollout.tensors()
     with torch.no_grad():
         rows = zip(s2, pose2, strict=True)
-        v2 = torch.stack([agent.q(*row, dqn.BFLOAT16).amax(1) for row in rows])  # (T, L)
+        v2 = torch.stack([agent.q(*row, c.bfloat16).amax(1) for row in rows])  # (T, L)
     y = lambda_returns(r.float(), v2, terminated, truncated, c.gamma, c.lam).flatten()  # (T * L,)
     s, a, pose = s.flatten(0, 1), a.flatten(), pose.flatten(0, 1)
     for i in minibatches(len(y), c, rng):
@@ -148,7 +147,7 @@ def learn(agent: Agent, rollout: Rollout, c: Config, rng: Generator) -> None:
             b_s[flip] = b_s[flip].flip(-1)
             b_a[flip] = World.num_actions - 1 - b_a[flip]
             b_pose[flip] *= torch.tensor([1, -1, 1, -1])
-        q_sa = agent.q(b_s, b_pose, dqn.BFLOAT16).gather(1, b_a[:, None])[:, 0]  # (B,)
+        q_sa = agent.q(b_s, b_pose, c.bfloat16).gather(1, b_a[:, None])[:, 0]  # (B,)
         loss = nn.functional.huber_loss(q_sa, y[i], delta=c.huber_delta)
         agent.optimizer.zero_grad()
         loss.backward()
@@ -181,7 +180,7 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
 
 MemoryConfig = recipe(
     "MemoryConfig", PQNConfig,
-    command="-m extras.lessons.memory", pilot="memory", train=staticmethod(train),
+    program="-m extras.lessons.memory", pilot="memory", train=staticmethod(train),
     network=QNetwork, steps=220_000, lr_final=0.05, swa_fraction=0.2,
     forward_reward=0.25, goal_bonus=200.0, far_bonus=20.0,
 )  # fmt: skip

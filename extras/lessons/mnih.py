@@ -20,7 +20,7 @@ decay factors of these means. PyTorch's own RMSprop with momentum 0.95 is anothe
 each move adds 0.95 of the one before, up to 20 times as much if all go in one direction.
 
 **What is different from dqn.py**, in two lines of `train`, marked [!], and in its settings:
-    BFLOAT16         off: all numbers have 32 bits
+    bfloat16         off: all numbers have 32 bits
     agent.optimizer  RMSprop, at a constant rate
     TextbookConfig   all [+] off but num_envs: one-step targets, no Double DQN, no mirror, a loss
                      that is straight beyond errors of 1, a constant rate, no mean of the weights,
@@ -50,7 +50,6 @@ import torch
 from numpy.random import Generator
 from torch import Tensor
 
-import dqn
 from deepflight import Config
 from dqn import Agent, Replay, due, learn, linear_schedule, mirror
 from env import VecForest
@@ -79,7 +78,6 @@ class RMSprop(torch.optim.Optimizer):
 
 def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Iterator[tuple]:
     """Algorithm 1 with Mnih's optimizer, in float32; [!] marks what differs from dqn.train."""
-    dqn.BFLOAT16 = False  # [!]
     replay = Replay(c.replay_size, c.num_envs)  # 1
     agent = Agent(c, envs.num_actions, rng)  # 2, 3
     agent.optimizer = RMSprop(agent.q.parameters(), c.lr)  # [!]
@@ -108,7 +106,7 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
 
 
 TextbookConfig = recipe(
-    "TextbookConfig", Config, command="-m extras.lessons.mnih textbook",
+    "TextbookConfig", Config, program="-m extras.lessons.mnih textbook",
     double=False, n_steps=1, mirror=False, huber_delta=1.0, lr_final=1.0, swa_fraction=0.0,
     forward_reward=0.0, goal_bonus=0.0, far_bonus=0.0, beacon_recipe={},
 )  # fmt: skip
@@ -117,7 +115,7 @@ TextbookConfig = recipe(
 # 10,000 steps. We follow the code.
 MnihConfig = recipe(
     "MnihConfig", TextbookConfig,
-    command="-m extras.lessons.mnih", pilot="mnih", train=staticmethod(train),
+    program="-m extras.lessons.mnih", pilot="mnih", train=staticmethod(train), bfloat16=False,
     steps=1_400_000, replay_size=1_000_000, learning_starts=50_000,
     target_every=10_000, epsilon_final=0.1, epsilon_decay=1_000_000,
 )  # fmt: skip
@@ -127,7 +125,6 @@ def main() -> int:
     """Mnih's settings, or after the word `textbook` those of the textbook."""
     if sys.argv[1:2] == ["textbook"]:
         return run(TextbookConfig, sys.argv[2:])
-    dqn.BFLOAT16 = False  # here too: resuming compares it before `train` begins
     return run(MnihConfig, sys.argv[1:])
 
 

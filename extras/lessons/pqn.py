@@ -160,7 +160,7 @@ def learn(agent: Agent, rollout: Rollout, c: Config, rng: Generator) -> None:
     """Learn from a full rollout. Its targets are computed once, so they stand still meanwhile."""
     s, a, r, s2, terminated, truncated = rollout.tensors()
     with torch.no_grad():
-        v2 = torch.stack([agent.q(row, dqn.BFLOAT16).amax(1) for row in s2])  # (T, L)
+        v2 = torch.stack([agent.q(row, c.bfloat16).amax(1) for row in s2])  # (T, L)
     y = lambda_returns(r.float(), v2, terminated, truncated, c.gamma, c.lam).flatten()  # (T * L,)
     s, a = s.flatten(0, 1), a.flatten()  # (T * L, 4, 84, 84), (T * L,)
     for i in minibatches(len(y), c, rng):
@@ -169,7 +169,7 @@ def learn(agent: Agent, rollout: Rollout, c: Config, rng: Generator) -> None:
             flip = torch.from_numpy(rng.random(len(i)) < 0.5)  # (B,)
             b_s[flip] = b_s[flip].flip(-1)
             b_a[flip] = World.num_actions - 1 - b_a[flip]
-        q_sa = agent.q(b_s, dqn.BFLOAT16).gather(1, b_a[:, None])[:, 0]  # (B,)
+        q_sa = agent.q(b_s, c.bfloat16).gather(1, b_a[:, None])[:, 0]  # (B,)
         loss = nn.functional.huber_loss(q_sa, y[i], delta=c.huber_delta)
         agent.optimizer.zero_grad()
         loss.backward()
@@ -203,7 +203,7 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
 # Without effect: replay_size, learning_starts, update_every, target_every, double and n_steps.
 PQNConfig = recipe(
     "PQNConfig", Config,
-    command="-m extras.lessons.pqn", pilot="pqn", train=staticmethod(train),
+    program="-m extras.lessons.pqn", pilot="pqn", train=staticmethod(train),
     network=QNetwork, validate_every=25_000,
     rollout=setting(16, "control steps of each drone between two updates", 1, 10**4),
     epochs=setting(2, "passes over each rollout", 1, 100),
@@ -212,7 +212,7 @@ PQNConfig = recipe(
     forward_reward=1.0, far_bonus=115.0,
 )  # fmt: skip
 PlainConfig = recipe(
-    "PlainConfig", PQNConfig, command="-m extras.lessons.pqn plain", pilot="plain",
+    "PlainConfig", PQNConfig, program="-m extras.lessons.pqn plain", pilot="plain",
     network=dqn.QNetwork, steps=150_000,
 )  # fmt: skip
 

@@ -71,7 +71,7 @@ def test_a_share_of_each_batch_is_demonstrated() -> None:
 def test_the_loss_is_that_of_td_targets_and_of_missed_margins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(dqn, "BFLOAT16", False)
+    monkeypatch.setattr(dqn.DQNConfig, "bfloat16", False)
     c, rng = DemoConfig(n_steps=2, gamma=0.9, margin=3.0), np.random.default_rng(0)
     b = demonstrations.sample(filled(40.0), filled(40.0), 0.5, c, rng)
     agent = dqn.Agent(c, 9, rng)

@@ -211,7 +211,7 @@ def td_loss_by_hand(agent: dqn.Agent, b: dqn.Batch) -> float:
 def test_the_loss_is_that_of_imitation_and_with_bellman_of_td_targets_too(
     bellman: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dqn, "BFLOAT16", False)
+    monkeypatch.setattr(dqn.DQNConfig, "bfloat16", False)
     rng = np.random.default_rng(0)
     b = filled(VecForest(WORLD, 2, [])).sample(32, 2, 0.9, rng)
     agent = dqn.Agent(c := ExpertConfig(bellman=bellman), 9, rng)
@@ -238,7 +238,7 @@ def finish(c: Config, folder: Path, cuts: Sequence[int] = ()) -> Run:
     for cut in cuts:
         while run.envs.steps < cut:
             next(run.loop)
-        run.save()
+        run.save_checkpoint()
         keys = "config", "actions", "forests", "agent", "optimizer", "rng", "log"
         run = Run(c, folder, deepflight.load(folder / "checkpoint.pt", *keys))
     assert run.go() == 0

@@ -50,12 +50,9 @@ def test_the_textbook_has_no_piece_that_is_marked_but_num_envs() -> None:
     assert {key for key in book if book[key] != recipe[key]} == marked - {"num_envs", "beacon"}
 
 
-def test_a_training_with_rmsprop_interrupted_is_uninterrupted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(dqn, "BFLOAT16", True)  # and back, after the test
+def test_a_training_with_rmsprop_interrupted_is_uninterrupted(tmp_path: Path) -> None:
     c = MnihConfig(**SMALL, steps=240)
     whole = finish(c, tmp_path / "whole")
-    assert not dqn.BFLOAT16
+    assert not c.bfloat16
     assert isinstance(whole.agent.optimizer, RMSprop)
     assert_same_training(whole, finish(c, tmp_path / "cut", cuts=(8, 168)))
