@@ -36,7 +36,8 @@ LESSONS = {f"DQN, seed {seed}": (name, "dqn") for seed, name in enumerate(SEEDS)
     "imitation from disparity, seed 0": ("imitation-disparity", "imitation"),
     "PQN, seed 0": ("pqn", "pqn"), "PQN, seed 1": ("pqn-1", "pqn"),
     "PQN, seed 2": ("pqn-2", "pqn"), "memory, seed 0": ("memory", "memory"),
-    "memory, seed 1": ("memory-1", "memory"), "the planner": ("imitation", "laser"),
+    "memory, seed 1": ("memory-1", "memory"), "DRQN, seed 0": ("drqn", "drqn"),
+    "DRQN, seed 1": ("drqn-1", "drqn"), "the planner": ("imitation", "laser"),
 }  # fmt: skip
 
 
