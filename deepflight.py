@@ -148,7 +148,7 @@ class Run:
         self.folder.mkdir(parents=True, exist_ok=True)
         save(self.folder / "config.json", json.dumps(asdict(c), indent=2).encode())
         with stop_signals() as stopped:
-            print(f"{self.folder}: {c.steps:,} steps, {c.num_envs} at a time\n\n{HEAD}", flush=True)
+            print(f"{c.steps:,} steps; weights: {self.folder / 'best.pt'}\n\n{HEAD}", flush=True)
             for _ in self.loop:
                 if not np.isfinite(self.agent.loss):
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")
@@ -351,7 +351,7 @@ def load(path: Path | str, *keys: str) -> dict[str, Any]:
         content = torch.load(path, weights_only=True)
         return {key: content[key] for key in keys}
     except Exception as error:  # a foreign file can fail in any way
-        why = getattr(error, "strerror", None) or "it is damaged, or no file of this program"
+        why = getattr(error, "strerror", None) or "it is damaged, or another kind of file"
         raise InputError(f"{path} cannot be read: {why}") from error
 
 

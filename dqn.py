@@ -96,7 +96,7 @@ class DQNConfig:
     target_every: int = setting(2_000, "control steps per target network sync (ours)", 1, 10**9)
     epsilon_final: float = setting(0.05, "share of random actions in the end; at first 1", 0, 1)
     epsilon_decay: int = setting(40_000, "control steps until epsilon_final", 1, 10**9)
-    lr: float = setting(2.5e-4, "learning rate of Adam [Mnih15: of RMSprop]", 0, 1)
+    lr: float = setting(2.5e-4, "learning rate of Adam [Mnih15: of RMSprop]", 1e-9, 1)
     num_envs: int = setting(8, "[+] environments side by side; 1: off", 1, 1000)
     double: bool = setting(True, "[+] Double DQN [van Hasselt 2016]; --no-double: off", 0, 1)
     n_steps: int = setting(5, "[+] true rewards in a target; 1: off", 1, 100)
@@ -111,7 +111,7 @@ class DQNConfig:
         for f in fields(self):
             legal, value = f.metadata["legal"], getattr(self, f.name)
             if f.type is not str and not legal[0] <= value <= legal[1]:
-                raise InputError(f"{f.name} is {value}, allowed are {legal[0]:,g} to {legal[1]:,g}")
+                raise InputError(f"{f.name} is {value}, allowed are {legal[0]:,} to {legal[1]:,}")
         # The least that `sample` can draw from: one row, three before it for its observation, and
         # n_steps after it for its rewards.
         least = self.num_envs * (self.n_steps + 4)
