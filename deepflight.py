@@ -11,8 +11,8 @@ shaped reward, validation, files, then `eval` with its statistics, and the comma
 
 `train` prints a row after each validation:
 
-         step  eps   /s  left  return | return length  cross  crash
-       15,000 0.64  126   24m   -16.8 |   -6.7    119    21%     6%
+         step  eps   /s   min  return | return length  cross  crash
+       15,000 0.64  126    24   -16.8 |   -6.7    119    21%     6%
 
 After 15,000 control steps 64 % of the actions are random. The training makes 126 steps a second, 24
 minutes are left, and the last 100 episodes had a mean return of -16.8 (in tables and logs the plain
@@ -25,7 +25,7 @@ A seed is a forest, and there are three sets of them:
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
 A run's folder holds config.json, log.csv, checkpoint.pt and best.pt, the weights: those of the best
-validation, and once the last tenth of the steps has begun the mean of all weights in it.
+validation, or in the last tenth of the steps the mean over that tenth so far.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -67,7 +67,7 @@ VALIDATION = range(10**9, 10**9 + 48)
 
 @dataclass(frozen=True)
 class Config(dqn.DQNConfig):
-    """All settings; each is a flag of `train`. [+] as in dqn.py: not in the textbook."""
+    """All settings; each is a flag of `train`. [+] as in dqn.py: not in [Mnih15]."""
 
     seed: int = setting(0, "of everything random", 0, 10**18)
     beacon: bool = setting(False, "[+] put a visible pole at the goal", 0, 1)
@@ -77,7 +77,7 @@ class Config(dqn.DQNConfig):
     goal_bonus: float = setting(125.0, "[+] for arrival at the goal; 0: off", 0, 1e6)
     far_bonus: float = setting(200.0, "[+] for leaving by the far edge; 0: off", 0, 1e6)
 
-    # The rest are no settings, but a lesson in extras/ may replace them.
+    # Skip at first: no settings, but a lesson in extras/ may replace them.
     train: ClassVar[Callable] = staticmethod(dqn.train)
     network: ClassVar[type] = QNetwork
     pilot: ClassVar[str] = "dqn"  # what the trained network is called
@@ -106,8 +106,8 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     changes the task: the paper counts the far edge as a crash, and here it is worth more than
     arrival. So look at the share that arrived too, and not only at the share that crossed.
 
-    On purpose, these parts change which way of flying is best: they are not potential-based, as
-    gamma * f(s2) - f(s) is for any f [Ng 1999]. Every printed or logged return is the paper's.
+    On purpose, these parts change which way of flying is best. Potential-based ones, gamma * f(s2)
+    - f(s) for any f, would not [Ng 1999]. Every printed or logged return is the paper's.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -118,8 +118,8 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
 
 # -------------------------------------------------- train: what stands around the loop of dqn.py
 
-HEAD = "     step  eps   /s  left  return | return length  cross  crash"
-ROW = "{step:9,} {epsilon:4.2f} {speed:4.0f} {left:4.0f}m {train_return:7.1f} |"
+HEAD = "     step  eps   /s   min  return | return length  cross  crash"
+ROW = "{step:9,} {epsilon:4.2f} {speed:4.0f} {left:5.0f} {train_return:7.1f} |"
 ROW += "{validation_return:7.1f} {validation_steps:6.0f} {validation_crossed:6.0%}"
 ROW += " {validation_crash:6.0%}"
 
@@ -133,7 +133,7 @@ class Run:
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log = c, folder, []
         self.rng = np.random.default_rng(c.seed)
-        self.forest_rng = np.random.default_rng([c.seed, 1])  # exploring changes no forest
+        self.forest_rng = np.random.default_rng([c.seed, 1])  # so exploring changes no forest
         seeds = (int(self.forest_rng.integers(TRAIN_END)) for _ in count())
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)
@@ -204,12 +204,12 @@ class Run:
             s2, r, terminated, truncated, drones = self.envs.step(actions)
             r = shaped_reward(r, drones, self.c)  # (L,)
             self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
-        if self.forest_rng.bit_generator.state != saved["forests"]:  # more or fewer have begun
+        if self.forest_rng.bit_generator.state != saved["forests"]:  # not as many have begun
             raise InputError(f"{self.folder}: its actions lead to other episodes on this machine")
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state, self.log = saved["rng"], saved["log"]
-        if saved["config"]["steps"] != self.c.steps:  # lr too goes by the new length, so it rises
+        if saved["config"]["steps"] != self.c.steps:  # by the new length lr rises again
             self.agent.averaged.n_averaged.zero_()  # a longer training averages its own last share
 
 
@@ -219,8 +219,8 @@ def dqn_pilot(q: QNetwork) -> Pilot:
 
 
 def fly_random(seeds: Sequence[int], world: World) -> list[Episode]:
-    """The baseline: 2,000 random episodes or more, equally many in each forest, because they vary
-    so much in length."""
+    """The baseline: 2,000 random episodes (rounded up), equally many in each forest, because they
+    vary so much in length."""
     pilot, repeats = env.random_pilot(np.random.default_rng(0)), -(-2000 // len(seeds))
     return [episode for _ in range(repeats) for episode in fly(pilot, seeds, world)]
 

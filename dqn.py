@@ -85,7 +85,7 @@ def setting(default: Any, text: str, *legal: Any) -> Any:
 
 @dataclass(frozen=True)
 class DQNConfig:
-    """The hyperparameters. [+] is not in the textbook; its text says what switches it off."""
+    """The hyperparameters. [+] is not in [Mnih15]; its text says what switches it off."""
 
     steps: int = setting(200_000, "control steps in all", 1, 10**9)
     gamma: float = setting(0.99, "discount of a step [DF II-A]", 0, 1)
@@ -103,7 +103,7 @@ class DQNConfig:
     mirror: bool = setting(True, "[+] reflect half of every batch; --no-mirror: off", 0, 1)
     huber_delta: float = setting(10.0, "[+] the hardest pull of a TD error; 1: Mnih's", 1e-3, 1e6)
     lr_final: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
-    swa_fraction: float = setting(0.1, "[+] last share of steps, weights averaged; 0: off", 0, 0.5)
+    swa_fraction: float = setting(0.1, "[+] average weights in this last share; 0: off", 0, 0.5)
     # Half as many bits make convolutions quicker, on processors that know them. Mnih's lesson: off.
     bfloat16: ClassVar[bool] = bool(torch.cpu.get_capabilities().get("avx512_bf16"))
 
@@ -269,10 +269,10 @@ def mirror(b: Batch, actions: int, rng: Generator) -> Batch:
     Flight, reward and camera are symmetric, so the reflection is one more true transition. Only the
     forest's grid is not quite symmetric: it stands 0.5 m off centre.
     """
-    flip = torch.from_numpy(rng.random(len(b.a)) < 0.5)  # (B,)
+    half = torch.from_numpy(rng.random(len(b.a)) < 0.5)  # (B,)
     for frames in (b.s, b.s2):
-        frames[flip] = frames[flip].flip(-1)
-    b.a[flip] = actions - 1 - b.a[flip]
+        frames[half] = frames[half].flip(-1)
+    b.a[half] = actions - 1 - b.a[half]
     return b
 
 
@@ -304,7 +304,7 @@ def td_target(b: Batch, q2: Tensor, q2_online: Tensor) -> Tensor:
     """The TD target y (B,): r + gamma_n * max_a2 Q^(s2, a2), or r where the episode terminated.
 
     q2 (B, A): Q^(s2, .), which says what an action is worth. q2_online (B, A): the values by which
-    a2 is chosen. In the textbook both are the same, so the value of a2 is the maximum.
+    a2 is chosen. In [Mnih15] both are the same, so the value of a2 is the maximum.
 
     [+double] A maximum of noisy values is too high (overestimation bias). Let two actions both be
     worth 0, and let Q^ err by +1 and -1: the maximum is 1. If Q chooses a2 instead, whose errors
@@ -355,8 +355,8 @@ def linear_schedule(step: int, first: float, final: float, steps: int) -> float:
 
 
 def due(every: int, step: int, num_envs: int) -> int:
-    """How many multiples of `every` lie among the control steps that a pass of all environments
-    has made. `step` is the last of them: 9 to 16 hold two multiples of 4, so two updates are due.
+    """How many multiples of `every` lie among the num_envs control steps of one pass, of which
+    `step` is the last: 9 to 16 hold two multiples of 4, so two updates are due.
 
     >>> due(4, 16, 8), due(2_000, 16, 8)
     (2, 0)

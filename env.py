@@ -74,7 +74,7 @@ class World(Scene):
     width: float = 50.0  # m; this and all down to jitter: authors' simulator
     back: float = 2.0  # m, how far the drone may retreat behind the start
     grid: tuple[int, int] = (15, 10)  # trunks along x and along y
-    first: tuple[float, float] = (7.5, -22.0)  # m, x and y of the first one before jitter
+    first: tuple[float, float] = (7.5, -22.0)  # m, x and y of the first trunk, before jitter
     spacing: tuple[float, float] = (6.0, 5.0)  # m
     jitter: tuple[float, float] = (1.0, 2.5)  # m, uniform, either way
     speed: float = 5.0  # m/s, authors' simulator
@@ -104,9 +104,9 @@ def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
     """
     if outcome in ("crash", "far", "back", "side"):
         return world.r_crash
-    too_near = max(world.d_neg - d_obs, 0) / (world.d_neg - world.d_crash)  # 0 to 1
+    r_near = world.r_precrash * (max(world.d_neg - d_obs, 0) / (world.d_neg - world.d_crash))
     r_safe = world.r_safe if d_obs > world.d_neg else 0.0
-    return r_safe + world.r_precrash * too_near + (1 - d_goal / world.length)
+    return r_safe + r_near + (1 - d_goal / world.length)
 
 
 def plant(seed: int, world: World) -> ndarray:
@@ -175,8 +175,8 @@ class Drone:
         self.d_obs = trunk.distance if trunk else self.world.laser_range  # None: out of reach
         self.d_goal = math.dist((x, y), (self.world.length, 0))
         frame = draw_frame(self.pose, self.trunks, self.world)  # (84, 84)
-        before = self.observation[1:] if self.actions else [frame] * (STACK - 1)
-        self.observation = np.stack([*before, frame])  # (4, 84, 84)
+        older = self.observation[1:] if self.actions else [frame] * (STACK - 1)
+        self.observation = np.stack([*older, frame])  # (4, 84, 84)
 
     def judge(self) -> str:
         """How the episode has ended: the first of OUTCOMES that holds, or "" in the air."""

@@ -25,17 +25,17 @@ Where does a ray meet a trunk?
 
     half_chord = sqrt(radius^2 - across^2)      by Pythagoras, if across < radius
     distance   = along - half_chord             from the camera to the surface
-    cosine     = half_chord / radius            1 where the ray meets the surface at # head-on,
-                                                0 where it grazes it (angle of incidence)
+    cosine     = half_chord / radius            of the angle of incidence, at #: 1 where the ray
+                                                meets it head-on, 0 where it grazes it
 
-One ray in numbers: a trunk of radius 0.5 m stands 10 m ahead and 0.3 m to the right. For the ray
-straight ahead, along = 10 and across = 0.3, so half_chord = 0.4 and the surface is 9.6 m away.
+One ray in numbers: a trunk of radius 0.5 m stands 10 m ahead and 0.3 m to the left. For the ray
+straight ahead along = 10, across = 0.3, half_chord = 0.4, distance = 9.6 and cosine = 0.8.
 
 A pinhole camera has two rules:
   * Column i looks along tan(bearing) = (41.5 - i) / 42, positive to the left. The columns are
     equally spaced on the image plane, and not in angle.
   * Row i, at depth z, looks at a point (41.5 - i) / 42 * z metres above the camera. Depth is
-    measured along the optical axis. With distance along the ray, straight walls would look bent.
+    measured along the optical axis. With distance along the ray, straight edges would look bent.
 The trunk of the example is 9.6 m away. Its top is 4 m higher than the camera, its foot 2 m lower,
 so it fills the rows from 41.5 - 42 * 4 / 9.6 = 24.0 to 41.5 + 42 * 2 / 9.6 = 50.25.
 
@@ -130,8 +130,8 @@ def shade(grey: ndarray | float, air: ndarray | float, depth: ndarray, scene: Sc
 
 @cache
 def background(scene: Scene) -> ndarray:
-    """The column (84, 1) uint8 behind all trunks: sky above the horizon, ground below. A row of
-    slope -t meets the ground at depth altitude / t."""
+    """The column (84, 1) uint8 behind all trunks: sky, and ground, whose air is taken as its depth.
+    A row of slope -t meets the ground at depth altitude / t."""
     depth = np.where(SLOPES < 0, scene.altitude / np.abs(SLOPES), np.inf)[:, None]  # (84, 1) m
     return shade(scene.ground, depth, depth, scene).astype(np.uint8)
 

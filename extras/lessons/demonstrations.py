@@ -18,9 +18,9 @@ that teaches cannot test.)
 
 **The idea** is that of [Hester 2018], DQfD. A transition says what reward followed, and the TD loss
 learns that. But nobody tried the other eight actions, so nothing corrects their Q, and the maximum
-in the TD target may take one that is too high. A demonstration
-says one thing more, that somebody who saw s chose a. So Q(s, a) should be the greatest of the nine,
-by a margin, 5. The large-margin loss is how far it falls short of that:
+in the TD target may pick a false one. A demonstration says more: that somebody who saw s chose a.
+So Q(s, a) should be the greatest of the nine, by a margin, 5. The large-margin loss is how far it
+falls short of that:
 
     max over b of (Q(s, b) + m)  -  Q(s, a)        m is 0 where b = a, and otherwise 5
 
@@ -51,8 +51,8 @@ others, from trainings of an earlier version, over 200 (results/demonstrations.j
 In 80 steps no update is due, so the first line is what the 2,000 updates on demonstrations make.
 Its pilots fly 338 and 191 % longer than random, as dqn does after 10,000 steps. After 60,000 steps
 the lead is no larger than the spread of seeds. Demonstrations in later batches raised the return,
-and crashes with it. Our explanation: demonstrated episodes do not crash, and a drone that explores
-little besides has seen too few crashes to know when one is coming.
+and crashes with it. Our explanation: demonstrations hold no crash, and a drone that explores little
+sees too few. With more exploring (last line) it hardly crashes.
 
 [Hester 2018]  Deep Q-learning from demonstrations, AAAI; it also has a prioritized replay
 """

@@ -9,13 +9,13 @@
 already. How well can a network fly that learns from this expert and not from rewards?
 
 **The expert** is a planner, `plan`. It has a laser scanner and knows its pose, so it is privileged:
-the network has four frames and nothing else. It adds up the rewards to come along 81 candidate
+the network has four frames only. The planner adds up the rewards to come along 81 candidate
 trajectories. Each holds one yaw rate for 0.6 s, then another or the same for 1.6 s. It ends early
 where it crashes, leaves the forest or arrives. The reward of step k counts gamma^k times. Where a
 trajectory does not end early, `plan` pretends that the drone then turns to the goal or to the far
-edge and flies straight there, through all trunks and without rewards, for its bonus: gamma^n times
-it, where n steps lead from now to there. The better one is added. An action is worth what the best
-trajectory is worth that begins with it. These nine values are the scores.
+edge and flies straight there, through all trunks and without rewards, n steps from now. The better
+bonus, each times its gamma^n, is added. An action is worth what the best trajectory is worth that
+begins with it. These nine values are the scores.
 
 In numbers, where arrival is worth 125 and no other bonus is paid: fly straight on from the start,
 far from trunks. The 22 steps earn 6.2. The goal is then 79 m or 158 steps away, so
@@ -29,7 +29,7 @@ labels there. In its own episodes it has them [Ross 2011, DAgger].
 
 The network cannot do all that the expert does, because it sees less. It learns what an action is
 worth on average over all the places that look alike. Say that it sees an edge, and one time in four
-this is the far one. Then straight on is worth 6 more than turning, otherwise 6 less: on average 3
+this is the far one. If so, straight on is worth 6 more than turning, else 6 less: on average 3
 less. So it turns.
 
 Its nine outputs are not Q. From scores and outputs we subtract their mean over the actions: 26, 24

@@ -24,14 +24,14 @@ of grey level 220 it is 90 + (220 - 90) * (1 - 8.5 / 40) = 192, brighter than th
 of disparity it is 510 / 8.5 = 60 in both forests.
 
 A real stereo camera makes errors of its own. It must find each point of the left picture in the
-right one, and on a trunk of one colour it can find only the two edges. Take a pair of pictures 640
-pixels wide, whose lenses stand 12 cm apart. Its focal length is 320 pixels, so the shift is 320 *
-0.12 / 8.5 = 4.5 pixels. Measured in whole pixels, rounded down, it is 4. A pixel is 510 / (320 *
-0.12) = 13 levels of our frame, which says 52 in place of 60.
+right one, and a trunk of one colour shows only its two edges, so there are holes between. And it
+measures whole pixels. With lenses 12 cm apart and a focal length of 320 pixels the shift is 320 *
+0.12 / 8.5 = 4.5 pixels; rounded down it is 4. A pixel is 510 / (320 * 0.12) = 13 levels of our
+frame, which says 52 in place of 60.
 
 **Domain randomization** lets what must not matter vary in the training, so that nothing can be
 learnt from it [Tobin 2017]. Each forest gets a random look, from ranges that include all tested
-looks. (Haze is not varied for disparity.) The forest determines the look, and forest and
+looks. (All but haze, for disparity.) The forest determines the look, and forest and
 pose determine the noise. So an episode is still determined by its seed and its actions, and an
 interrupted training can go on.
 
@@ -45,7 +45,7 @@ The network, the loss, the planner and the loop are the same.
       in the plain world.
     * The disparity pilot crosses 86.5 %, whatever the paint and the light. With all errors of a
       stereo camera together it crosses 66.5 %, and 86 % if it was trained with random errors.
-      Of the four pilots a real drone should get this last one.
+      Of the four we would try this one on a real drone.
 
 Legend
     level a step of a frame's 0 to 255
@@ -87,7 +87,7 @@ class Look:
     vignette: float = 0.0  # the share of light that is lost in the corners
     blur: bool = False  # the mean of 3x3 pixels
     noise: float = 0.0  # levels, standard deviation, in every pixel of a grey frame
-    error: float = 0.0  # the same of disparity: in depth the error grows with the depth's square
+    error: float = 0.0  # the same of disparity; in m it grows with the square of the depth
     holes: float = 0.0  # the share of 4x4 blocks in a trunk where the camera finds no depth
     filled: bool = False  # a hole gets the last depth to its left, and not 0
     quantum: int = 1  # levels between two depths that the camera can tell apart

@@ -7,7 +7,7 @@
 
 DQN needs a replay because the steps of one drone are alike, and a target network because each
 update of Q moves its own targets. Here 128 drones fly at the same time, each in a forest of its
-own. Together they make 16 steps each, a **rollout** of 2,048 transitions that are unlike enough.
+own. 16 steps of each make a **rollout** of 2,048 transitions that are unlike enough.
 Q learns from these, twice, and forgets them. Nothing is drawn from a memory, and the targets come
 from Q itself, as it was when the rollout began.
 
@@ -47,7 +47,7 @@ it makes three passes forward, Q(s), Q(s2) and Q^(s2), and one backward, which c
 it throws away what it could learn from again. In a slow world, as with a real drone, steps are dear
 and multiplications cheap, so there a replay is the better idea.
 
-**What came out** over 1,000 test forests, with smaller bonuses than dqn's, which may explain part:
+**What came out** over 1,000 test forests; its smaller bonuses may explain part of the return:
 
     three seeds   crossed, %         hit a trunk, %    return          steps     minutes
     pqn           59.4, 56.6, 56.4   3.8, 16.9, 5.2    106, 102, 110   500,000   17, 16, 16
