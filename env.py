@@ -219,7 +219,7 @@ class VecForest:
                 drone.reset(seed)
         return np.array([drone.observation for drone in self.active])  # (E, 4, 84, 84)
 
-    def step(self, actions: Iterable[int]) -> tuple:
+    def step(self, actions: Iterable[int]) -> tuple[ndarray, ndarray, ndarray, ndarray, list]:
         """One control step of the active drones; actions: one for each, in order.
 
         Returns the new observations (E, 4, 84, 84), rewards (E,), terminated (E,), truncated (E,),
