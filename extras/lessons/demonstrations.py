@@ -29,8 +29,8 @@ are 14 and 5, so the loss is 14 - 1 = 13. It pulls the 9 down and the 1 up. If t
 second one was demonstrated, the others count as 6 and 5, 9 is more, and the loss is 0.
 
 The network learns from the demonstrations alone at first, in 2,000 updates. Then it flies, and
-because it need not begin by chance, epsilon is 0.05 from the start. Its next update comes after
-5,000 steps. With --demo-share 0.25 a quarter of every later batch is demonstrations, as in DQfD.
+because it need not fly at random first, epsilon is 0.05 from the start. Its next update comes after
+5,000 steps. Later batches hold no demonstrations; with --demo-share 0.25 a quarter of each is.
 
 **What is different from dqn.py**, marked [!] in `train`:
     demo_replay   a second replay, for demonstrations alone
@@ -45,14 +45,14 @@ others, from trainings of an earlier version, over 200 (results/demonstrations.j
     32 episodes alone (--steps 80)      16, 0 %    19, 16 %       16, -12
     32 episodes, then 60,000 steps      72, 55 %   4.5, 15.5 %    32, 20
     dqn, 60,000 steps                   43, 60 %   1.5, 9.5 %     26, 12
-    32, 60,000, --demo-share 0.25       35, 27 %   34, 52.5 %     43, 43
-    the same, --epsilon-decay 40000     22, 16 %   1, 0.5 %       31, 27
+    line 2 with --demo-share 0.25       35, 27 %   34, 52.5 %     43, 43
+    and with --epsilon-decay 40000      22, 16 %   1, 0.5 %       31, 27
 
 In 80 steps no update is due, so the first line is what the 2,000 updates on demonstrations make.
 Its pilots fly 338 and 191 % longer than random, as dqn does after 10,000 steps. After 60,000 steps
-the lead is no larger than the spread of seeds. Demonstrations in later batches raised the return,
-and crashes with it. Our explanation: demonstrations hold no crash, and a drone that explores little
-sees too few. With more exploring (last line) it hardly crashes.
+the lead is no larger than the spread of seeds. Demonstrations later on raised return and crashes,
+and halved crossing. Our explanation: demonstrations hold no crash, and a drone that explores little
+sees too few. With more exploring (last line) few crash, and few cross.
 
 [Hester 2018]  Deep Q-learning from demonstrations, AAAI; it also has a prioritized replay
 """

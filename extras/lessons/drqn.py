@@ -25,15 +25,15 @@ is seen.
 **Backpropagation through time.** The loss at step t depends on the weights through h_t, and through
 h_(t-1) inside it, and so on. So a minibatch is no longer a set of single steps: it is a few drones,
 each with its whole rollout of 32 steps in order, and gradients run back through all 32. They stop
-there, at 3.2 s. What lies before has only its trace in the first hidden state, which was computed
-by older weights (a stale state) and is a constant now.
+there, at 3.2 s. What lies before left a trace in the first hidden state only: a constant now,
+computed by older weights (a stale state).
 
 **What differs from pqn.py**
     QNetwork   a GRU in place of the layer of 512. `look` makes of frames and last action what
                enters it, `recall` makes one step, `unroll` a rollout; `hidden_states` keeps those
                of a pilot's drones from step to step
     Rollout    keeps the action before each s too; there is none where an episode begins
-    Agent      keeps the hidden states of the drones, and those of the rollout's first step. They
+    Agent      keeps the hidden states of the drones, and those that enter the rollout. They
                are in the checkpoint, so a resumed training does not have to compute them again
     learn      unrolls: minibatches of 8 drones, 32 steps each
     mirror     off: a hidden state has no mirror image
@@ -42,14 +42,14 @@ by older weights (a stale state) and is a constant now.
 **What came out**, over 1,000 test forests; 250,000 steps each, half of pqn's 500,000:
 
                          arrived   crossed   hit a trunk   return
-    pqn                    8.9 %    59.4 %       3.8 %     105.9
+    pqn, seed 0            8.9 %    59.4 %       3.8 %     105.9
     drqn, seed 0          20.7 %    47.5 %       6.4 %      31.9
     drqn, seed 1           9.8 %    33.6 %       1.7 %      59.4
 
-It has hardly found out where it is: memory crosses 97 and 95 %. Both seeds cross less than pqn,
-which sees the same: 46 and 42 % of the validation episodes at the end, where pqn had 50 % after as
-many steps (twice the updates, half of each batch reflected). 41 and 59 % leave by a side. Yet seed
-0 arrives twice as often. More steps or longer rollouts we have not tried.
+It hardly knows where it is: memory.py crosses 97 and 95 %. Both seeds cross less than pqn, which
+has no memory: in validation 46 and 42 % at the end, pqn 50 % after as many steps (but twice the
+updates, half of each batch reflected). 41 and 59 % leave by a side. Yet seed 0 arrives twice as
+often. More steps or longer rollouts we have not tried.
 
 [Cho 2014] Learning phrase representations using RNN encoder-decoder, EMNLP. [Hausknecht 2015] Deep
 recurrent Q-learning for partially observable MDPs, AAAI Fall Symposium.
@@ -116,12 +116,12 @@ class QNetwork(pqn.QNetwork):
         """The hidden states (E, H). Each drone keeps its own, so that it is computed once a step,
         from that of the step before."""
         now = [(drone.seed, len(drone.actions)) for drone in drones]
-        late = [d for d, key in zip(drones, now, strict=True) if getattr(d, "key", None) != key]
-        if late:
-            s, last = torch.from_numpy(np.stack([d.observation for d in late])), last_actions(late)
+        todo = [d for d, key in zip(drones, now, strict=True) if getattr(d, "key", None) != key]
+        if todo:
+            s, last = torch.from_numpy(np.stack([d.observation for d in todo])), last_actions(todo)
             zero = torch.zeros(HIDDEN)
-            h = torch.stack([d.hidden if d.actions else zero for d in late])  # (B, H)
-            for drone, state in zip(late, self.recall(self.look(s, last), last, h), strict=True):
+            h = torch.stack([d.hidden if d.actions else zero for d in todo])  # (B, H)
+            for drone, state in zip(todo, self.recall(self.look(s, last), last, h), strict=True):
                 drone.hidden, drone.key = state, (drone.seed, len(drone.actions))
         return torch.stack([drone.hidden for drone in drones])
 
@@ -140,7 +140,7 @@ class Rollout(pqn.Rollout):
         self.envs = envs
 
     def add(self, *row: ndarray) -> None:
-        """Keep a row. No drone is reset yet, so the action of this row is the last but none."""
+        """Keep a row. drone.actions ends with this row's action; we want the one before."""
         super().add(*row, last_actions(self.envs.drones, before=1).numpy())
 
 
@@ -171,7 +171,7 @@ def learn(agent: Agent, rollout: Rollout, c: Config, rng: Generator) -> None:
     with torch.no_grad():
         h = q.unroll(s, last, agent.first, c.bfloat16)  # (T, L, H)
         steps = zip(s2, a, h, strict=True)
-        h2 = torch.stack([q.recall(q.look(x, b, c.bfloat16), b, h) for x, b, h in steps])
+        h2 = torch.stack([q.recall(q.look(x, u, c.bfloat16), u, h) for x, u, h in steps])
         v2 = q.head(h2).amax(2)  # (T, L)
     y = lambda_returns(r.float(), v2, terminated, truncated, c.gamma, c.lam)  # (T, L)
     for i in minibatches(c.num_envs, c, rng):  # (B,) drones

@@ -16,7 +16,7 @@ it, although no trunk stands elsewhere. There are two remedies.
 
 **Disparity** leaves out of the frame what must not matter. It is what a stereo camera measures: by
 how many pixels a point is shifted between the left and the right picture. That depends on geometry
-alone. Our frame says 510 / depth, and 255 at most.
+alone. Our frame says 510 / depth, 255 at 2 m and nearer.
 
 In numbers: a trunk stands 8.5 m away. A grey camera sees its bark, grey level 35, through haze that
 ends the view at 40 m: 90 + (35 - 90) * (1 - 8.5 / 40) = 46.7, darker than the sky's 90. With bark
@@ -31,7 +31,7 @@ frame, which says 52 in place of 60.
 
 **Domain randomization** lets what must not matter vary in the training, so that nothing can be
 learnt from it [Tobin 2017]. Each forest gets a random look, from ranges that include all tested
-looks. (All but haze, for disparity.) The forest determines the look, and forest and
+looks (for disparity all but haze). The forest determines the look, and forest and
 pose determine the noise. So an episode is still determined by its seed and its actions, and an
 interrupted training can go on.
 
@@ -41,11 +41,11 @@ The network, the loss, the planner and the loop are the same.
 
 **What came out** in 200 forests (results/transfer.json)
     * The grey pilot crosses 87 % in the world of its training, and 0 % where bark is bright or
-      striped, or at dusk. Trained with random looks it crosses 70 to 83 % in every look, and 77 %
-      in the plain world.
+      striped, or at dusk. A second one, trained with random looks, crosses 70 to 83 %, and
+      77 % in the plain world.
     * The disparity pilot crosses 86.5 %, whatever the paint and the light. With all errors of a
-      stereo camera together it crosses 66.5 %, and 86 % if it was trained with random errors.
-      Of the four we would try this one on a real drone.
+      stereo camera together it crosses 66.5 %. A fourth pilot, trained with random errors, crosses
+      86 %: we would try this one on a real drone.
 
 Legend
     level a step of a frame's 0 to 255
@@ -133,7 +133,7 @@ def wear(look: Look, pose: Sequence[float], trunks: ndarray, scene: Scene) -> nd
             frame, draw_frame(pose, trunks, replace(scene, camera="disparity")), look, scene
         )
     change = mismatch if scene.camera == "disparity" else expose
-    # The same noise for the same pose and forest. Without abs, 0.0 and -0.0 would differ.
+    # The seed: the bits of pose and first trunk. Without abs, 0.0 and -0.0 would differ.
     rng = np.random.default_rng(np.abs([*pose, *trunks[0]]).view(np.uint32))
     changed = change(frame.astype(float), look, scene, rng)  # (84, 84)
     return np.clip(np.rint(changed), 0, 255).astype(np.uint8)
@@ -160,7 +160,7 @@ def expose(frame: ndarray, look: Look, _scene: Scene, rng: Generator) -> ndarray
 
 def mismatch(frame: ndarray, look: Look, scene: Scene, rng: Generator) -> ndarray:
     """What a stereo camera gets wrong in a frame of disparity (84, 84)."""
-    if look.fat:  # each pixel shows the nearest point from fat to its left to 2 * fat to its right
+    if look.fat:  # widens trunks by fat px to the right, and by 2 * fat to the left
         padded = np.pad(frame, ((0, 0), (look.fat, 2 * look.fat)))
         shifted = [padded[:, i : i + PIXELS] for i in range(3 * look.fat + 1)]
         frame = np.maximum.reduce(shifted)  # (84, 84)
