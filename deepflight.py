@@ -106,8 +106,8 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     changes the task: the paper counts the far edge as a crash, and here it is worth more than
     arrival. So look at the share that arrived too, and not only at the share that crossed.
 
-    On purpose, these parts change which way of flying is best. Potential-based ones, gamma * f(s2)
-    - f(s) for any f, would not [Ng 1999]. Every printed or logged return is the paper's.
+    On purpose, these parts change which way of flying is best. Potential-based ones, for any f
+    gamma * f(s2) - f(s), would not [Ng 1999]. Every printed or logged return is the paper's.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -345,7 +345,7 @@ def load(path: Path | str, *keys: str) -> dict[str, Any]:
     """Read what save wrote, without running any code from the file. InputError if it cannot be
     read, is damaged, or does not hold these keys."""
     try:
-        archive = zipfile.ZipFile(path)  # with checksums, and flags that torch leaves at 0
+        archive = zipfile.ZipFile(path)  # its checksums miss the flags, which torch leaves at 0
         if archive.testzip() or any(part.external_attr for part in archive.infolist()):
             raise zipfile.BadZipFile
         content = torch.load(path, weights_only=True)

@@ -104,7 +104,7 @@ class DQNConfig:
     huber_delta: float = setting(10.0, "[+] the hardest pull of a TD error; 1: Mnih's", 1e-3, 1e6)
     lr_final: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
     swa_fraction: float = setting(0.1, "[+] average weights in this last share; 0: off", 0, 0.5)
-    # Half as many bits make convolutions quicker, on processors that know them. Mnih's lesson: off.
+    # Half as many bits make convolutions quicker on some processors. A lesson switches it off.
     bfloat16: ClassVar[bool] = bool(torch.cpu.get_capabilities().get("avx512_bf16"))
 
     def __post_init__(self) -> None:
