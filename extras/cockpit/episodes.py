@@ -52,12 +52,8 @@ class Recording(VecForest):
     def note(self, r: float) -> None:
         """Keep all that there is to show of the moment after a step of reward r."""
         drone, s = self.drone, self.drone.observation  # (4, 84, 84)
-        moment = {
-            "pose": drone.pose,
-            "d_obs": drone.d_obs,
-            "reward": r,
-            "return": drone.episode_return,
-        }
+        moment = {"pose": drone.pose, "d_obs": drone.d_obs, "reward": r}
+        moment |= {"return": drone.episode_return}
         moment |= {"q": self.q.values(s[None], [drone])[0].tolist()}  # A numbers
         self.moments.append(moment | {"frame": b64encode(s[-1]).decode()})
 
