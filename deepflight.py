@@ -24,8 +24,8 @@ A seed is a forest, and there are three sets of them:
     validation  [10^9, 2 * 10^9)    may choose the weights (best.pt)
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
-A run's folder holds config.json, log.csv, checkpoint.pt and best.pt, the weights: those of the best
-validation, or in the last tenth of the steps the mean over that tenth so far.
+A run's folder holds config.json, log.csv, validation.jsonl (one line an episode), checkpoint.pt and
+best.pt, the weights: those of the best validation, or in the last tenth of the steps their mean.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -131,7 +131,7 @@ class Run:
         """saved: the checkpoint of a training to go on with."""
         torch.set_num_threads(c.threads)
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
-        self.c, self.folder, self.log = c, folder, []
+        self.c, self.folder, self.log, self.flown = c, folder, [], []
         self.rng = np.random.default_rng(c.seed)
         self.forest_rng = np.random.default_rng([c.seed, 1])  # so exploring changes no forest
         seeds = (int(self.forest_rng.integers(TRAIN_END)) for _ in count())
@@ -169,10 +169,11 @@ class Run:
         q = copy.deepcopy(self.agent.averaged.module if averaged else self.agent.q)
         q.half().float()  # best.pt keeps half precision: fly that
         recent = measure(envs.episodes[-100:] or [drone.episode() for drone in envs.drones])
-        flown = measure(fly(dqn_pilot(q), VALIDATION, envs.world))
+        flown = fly(dqn_pilot(q), VALIDATION, envs.world)
+        self.flown += [json.dumps({"step": envs.steps} | episode) + "\n" for episode in flown]
         row = {"step": envs.steps, "episodes": len(envs.episodes), "epsilon": self.agent.epsilon}
         row |= {f"train_{key}": float(x.mean()) for key, x in recent.items()}
-        row |= {f"validation_{key}": float(x.mean()) for key, x in flown.items()}
+        row |= {f"validation_{key}": float(x.mean()) for key, x in measure(flown).items()}
         last = self.log[-1] if self.log else {"step": 0, "seconds": 0.0}
         speed = (envs.steps - last["step"]) / (seconds - last["seconds"])  # steps a second
         self.log.append(row | {"seconds": seconds})
@@ -183,15 +184,17 @@ class Run:
         lines = [self.log[0].keys(), *(row.values() for row in self.log)]
         text = "".join(",".join(map(str, line)) + "\n" for line in lines)
         save(self.folder / "log.csv", text.encode())
+        save(self.folder / "validation.jsonl", "".join(self.flown).encode())
         self.save_checkpoint()
         left = max(self.c.steps - envs.steps, 0) / speed / 60  # min
         print(ROW.format(**row, speed=speed, left=left), flush=True)
 
     def save_checkpoint(self) -> None:
         """Write the checkpoint, 34 MB. Of the replay it holds the actions, one byte each."""
+        forests, rng = self.forest_rng.bit_generator.state, self.rng.bit_generator.state
         content = {"config": asdict(self.c), "fingerprint": fingerprint(self.c), "log": self.log,
-                   "actions": self.envs.history, "forests": self.forest_rng.bit_generator.state,
-                   "rng": self.rng.bit_generator.state, "agent": self.agent.state_dict(),
+                   "flown": self.flown, "actions": self.envs.history, "forests": forests,
+                   "rng": rng, "agent": self.agent.state_dict(),
                    "optimizer": self.agent.optimizer.state_dict()}  # fmt: skip
         save(self.folder / "checkpoint.pt", content)
 
@@ -208,7 +211,8 @@ class Run:
             raise InputError(f"{self.folder}: its actions lead to other episodes on this machine")
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
-        self.rng.bit_generator.state, self.log = saved["rng"], saved["log"]
+        self.rng.bit_generator.state = saved["rng"]
+        self.log, self.flown = saved["log"], saved["flown"]
         if saved["config"]["steps"] != self.c.steps:  # by the new length lr rises again
             self.agent.averaged.n_averaged.zero_()  # a longer training averages its own last share
 
@@ -433,8 +437,8 @@ def make_run(args: argparse.Namespace, config: type[Config]) -> Run:
         return Run(config(**recipe | given), folder)
     if args.name or given.keys() - {"steps"}:
         raise InputError(f"{args.resume} keeps its settings: only --steps may be given")
-    keys = "config", "fingerprint", "actions", "forests", "agent", "optimizer", "rng", "log"
-    saved = load(args.resume / "checkpoint.pt", *keys)
+    keys = "config fingerprint log flown actions forests rng agent optimizer"
+    saved = load(args.resume / "checkpoint.pt", *keys.split())
     if (made_by := saved["fingerprint"]) != (here := fingerprint(config)):
         raise InputError(f"{args.resume} was made by {made_by}, and here is {here}")
     c = config(**saved["config"] | given)

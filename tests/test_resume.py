@@ -1,5 +1,6 @@
 """Interrupted is uninterrupted: a training that is cut and resumed ends with the same bytes."""
 
+import json
 import shlex
 import shutil
 import signal
@@ -18,9 +19,9 @@ from pytest import CaptureFixture, MonkeyPatch
 import deepflight
 import dqn
 from deepflight import Config, Run, load, main
-from env import World
+from env import World, refly
 
-KEYS = ("config", "fingerprint", "actions", "forests", "agent", "optimizer", "rng", "log")
+KEYS = ["config", "fingerprint", "log", "flown", "actions", "forests", "rng", "agent", "optimizer"]
 SMALL = {"steps": 400, "learning_starts": 100, "replay_size": 200, "target_every": 120}
 SMALL |= {"update_every": 16, "batch_size": 8}  # the replay wraps at step 200
 WORDS = [x for key, n in SMALL.items() for x in (f"--{key.replace('_', '-')}", str(n))]
@@ -79,8 +80,8 @@ def equal(a: object, b: object) -> bool:
 
 
 def assert_same_training(a: Path, b: Path) -> None:
-    """Two folders hold the same settings, weights, checkpoint and log."""
-    for name in ("best.pt", "config.json"):
+    """Two folders hold the same settings, weights, episodes, checkpoint and log."""
+    for name in ("best.pt", "config.json", "validation.jsonl"):
         assert (a / name).read_bytes() == (b / name).read_bytes(), name
     logs = [(folder / "log.csv").read_text().splitlines() for folder in (a, b)]
     one, two = ([line.rpartition(",")[0] for line in log] for log in logs)
@@ -112,6 +113,17 @@ def test_ctrl_c_and_a_kill_save_and_print_the_command_that_goes_on(
         command = shlex.split(line)
     assert command[:2] == [sys.executable, __file__] and main(command[2:], Small) == 0
     assert_same_training(whole.folder, Path("runs/small"))
+
+
+def test_every_validation_episode_is_kept_and_can_be_flown_again(whole: Run) -> None:
+    lines = (whole.folder / "validation.jsonl").read_text().splitlines()
+    episodes = [json.loads(line) for line in lines]
+    assert [(e.pop("step"), e["seed"] - 10**9) for e in episodes] == [
+        (step, forest) for step in (200, 400) for forest in (0, 1)
+    ]
+    for episode in episodes:
+        *_, drone = refly(episode, World())
+        assert drone.episode() == episode
 
 
 def test_a_finished_training_goes_on_when_it_gets_more_steps(whole: Run, tmp_path: Path) -> None:
