@@ -4,7 +4,7 @@
     python deepflight.py train --beacon         in a world where a pole makes the goal visible
     python deepflight.py train --resume DIR     go on with an interrupted training
     python deepflight.py eval                   fly weights/dqn.pt, which `train` made
-    python deepflight.py eval --weights FILE    fly other weights
+    python deepflight.py eval --weights DIR     fly the weights of a training, or of any file
 
 The loop that learns is dqn.train. This file holds the rest of the experiment: the settings, the
 shaped reward, validation, files, then `eval` with its statistics, and the command line.
@@ -147,8 +147,9 @@ class Run:
         began = time.perf_counter() - (self.log[-1]["seconds"] if self.log else 0)
         self.folder.mkdir(parents=True, exist_ok=True)
         save(self.folder / "config.json", json.dumps(asdict(c), indent=2).encode())
+        again = f'"{sys.executable}" {c.program}'
         with stop_signals() as stopped:
-            print(f"{c.steps:,} steps; weights: {self.folder / 'best.pt'}\n\n{HEAD}", flush=True)
+            print(f"{c.steps:,} steps; all files are in {self.folder}\n\n{HEAD}", flush=True)
             for _ in self.loop:
                 if not np.isfinite(self.agent.loss):
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")
@@ -156,9 +157,10 @@ class Run:
                     self.validate(time.perf_counter() - began)
                 if stopped and envs.steps < c.steps:
                     self.save_checkpoint()
-                    command = f'"{sys.executable}" {c.program} train --resume "{self.folder}"'
-                    print(f"saved at step {envs.steps:,}; to go on:\n{command}", file=sys.stderr)
+                    print(f"saved at step {envs.steps:,}; to go on:", file=sys.stderr)
+                    print(f'{again} train --resume "{self.folder}"', file=sys.stderr)
                     return 128 + stopped[0]
+        print(f'to fly it:\n{again} eval --weights "{self.folder}"')
         return 0
 
     def validate(self, seconds: float) -> None:
@@ -191,16 +193,15 @@ class Run:
 
     def save_checkpoint(self) -> None:
         """Write the checkpoint, 34 MB. Of the replay it holds the actions, one byte each."""
-        forests, rng = self.forest_rng.bit_generator.state, self.rng.bit_generator.state
         content = {"config": asdict(self.c), "fingerprint": fingerprint(self.c), "log": self.log,
-                   "flown": self.flown, "actions": self.envs.history, "forests": forests,
-                   "rng": rng, "agent": self.agent.state_dict(),
+                   "flown": self.flown, "actions": self.envs.history,
+                   "forests": self.forest_rng.bit_generator.state,
+                   "rng": self.rng.bit_generator.state, "agent": self.agent.state_dict(),
                    "optimizer": self.agent.optimizer.state_dict()}  # fmt: skip
         save(self.folder / "checkpoint.pt", content)
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Set everything as it was. All actions since the first step are flown again, which puts
-        the same transitions into the replay."""
+        """Set everything as it was. To fly all actions again puts the same into the replay."""
         print(f"flying {len(saved['actions']) * self.c.num_envs:,} steps again", flush=True)
         for actions in saved["actions"]:
             s = self.envs.reset_done()  # (L, 4, 84, 84)
@@ -223,17 +224,16 @@ def dqn_pilot(q: QNetwork) -> Pilot:
 
 
 def fly_random(seeds: Sequence[int], world: World) -> list[Episode]:
-    """The baseline: 2,000 random episodes (rounded up), equally many in each forest, because they
-    vary so much in length."""
+    """The baseline: 2,000 random episodes or a few more, because they vary so much in length."""
     pilot, repeats = env.random_pilot(np.random.default_rng(0)), -(-2000 // len(seeds))
     return [episode for _ in range(repeats) for episode in fly(pilot, seeds, world)]
 
 
 def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
-    """Fly a network and other pilots through the same forests: a table, JSON, and a film of the
-    network's first episode that crossed (or of the first)."""
+    """Fly a network and other pilots through the same forests: a table, JSON, and a film."""
     q, world, name = load_weights(args.weights, config.network)
-    seeds, film = range(args.first_seed, args.first_seed + args.episodes), args.out / "flight.gif"
+    seeds = range(args.first_seed, args.first_seed + args.episodes)
+    film = args.out / f"{args.weights.stem}.gif"
     if not (0 < args.episodes <= 10**6 and args.first_seed >= 0 and 0 < args.threads <= 64):
         raise InputError("allowed: episodes 1 to 10^6, first-seed 0 or more, threads 1 to 64")
     for path in {film, args.json or film}:  # better to fail now than after all episodes
@@ -243,6 +243,7 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
     print(f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n", flush=True)
     flown = {"random": fly_random(seeds, world)}
     for who, pilot in (config.baselines | {name: dqn_pilot(q)}).items():
+        print(f"flying {who}", file=sys.stderr)
         flown[who] = fly(pilot, seeds, world)
     metrics = {who: summarize(flown[who], flown["random"], len(seeds)) for who in flown}
     print_table(metrics)
@@ -258,10 +259,8 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
 
 
 def measure(episodes: list[Episode]) -> dict[str, ndarray]:
-    """One number an episode (F,): steps, progress in m, return, and 0 or 1 for how it ended.
-
-    Crossed means arrived at the goal, or left by the far edge.
-    """
+    """One number an episode (F,): steps, progress in m, return, and 0 or 1 for how it ended, where
+    crossed means arrived at the goal, or left by the far edge."""
     table = {key: np.array([e[key] for e in episodes]) for key in ("steps", "progress", "return")}
     ended = {key: np.array([e["outcome"] == key for e in episodes]) for key in env.OUTCOMES}
     return table | {"crossed": ended["goal"] | ended["far"]} | ended
@@ -366,14 +365,13 @@ def save_weights(path: Path, q: QNetwork, c: Config) -> None:
 
 
 def load_weights(path: Path | str, network: type = QNetwork) -> tuple[QNetwork, World, str]:
-    """Read a weights file: the network, its world, and the name of its pilot."""
+    """Read a weights file, or that in a run's folder: the network, its world, its pilot's name."""
+    path = Path(path) / "best.pt" if Path(path).is_dir() else path
     saved, q = load(path, "pilot", "beacon", "camera", "network"), network(World.num_actions)
     try:
         q.load_state_dict(saved["network"])
     except RuntimeError as error:
         raise InputError(f"{path} holds weights of another network: {saved['pilot']}") from error
-    if not all(tensor.isfinite().all() for tensor in q.parameters()):
-        raise InputError(f"{path} holds weights that are no finite numbers")
     return q, World(beacon=saved["beacon"], camera=saved["camera"]), saved["pilot"]
 
 
@@ -384,11 +382,12 @@ def fingerprint(c: Config | type[Config]) -> list:
 
 @contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """A list that Ctrl-C, SIGTERM and SIGHUP are written to, so that the running step can end. One
-    that nohup ignores stays ignored."""
+    """A list that Ctrl-C and the other signals are written to, so that the running step can end.
+    One that nohup ignores stays ignored."""
     stopped: list[int] = []
+    names = "SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1"  # clusters send the last one before the end
     with ExitStack() as afterwards:
-        for number in {getattr(signal, x, signal.SIGINT) for x in ("SIGINT", "SIGTERM", "SIGHUP")}:
+        for number in {getattr(signal, name, signal.SIGINT) for name in names}:
             if signal.getsignal(number) != signal.SIG_IGN:
                 old = signal.signal(number, lambda number, _: stopped.append(number))
                 afterwards.callback(signal.signal, number, old)
@@ -400,8 +399,7 @@ def stop_signals() -> Iterator[list[int]]:
 
 def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespace:
     """Read the command line; every setting is a flag of `train`."""
-    # argparse prints the usage before an error; without one, the error is a single line.
-    silent = {"prog": "deepflight.py", "usage": argparse.SUPPRESS}
+    silent = {"prog": "deepflight.py", "usage": argparse.SUPPRESS}  # so an error is a single line
     parser = argparse.ArgumentParser(**silent)
     commands = parser.add_subparsers(dest="command", required=True, metavar="train or eval")
     sub = commands.add_parser("train", help="train a pilot", **silent)
@@ -413,10 +411,9 @@ def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespac
         text = f"{f.metadata['help']} (default: {f.default})"
         sub.add_argument("--" + f.name.replace("_", "-"), help=text, **more)
     sub = commands.add_parser("eval", help="fly trained weights beside other pilots", **silent)
-    there = Path(__file__).parent / "weights"
-    sub.add_argument("--weights", type=Path, default=there / "dqn.pt", help="default: %(default)s")
-    beacon = {"action": "store_const", "const": there / "dqn-beacon.pt", "dest": "weights"}
-    sub.add_argument("--beacon", help="the shipped ones that see a beacon", **beacon)
+    shipped = Path(__file__).parent / "weights/dqn.pt"
+    text = "a file, or the folder of a training (default: %(default)s)"
+    sub.add_argument("--weights", type=Path, default=shipped, help=text)
     sub.add_argument("--episodes", type=int, default=100, help="default: %(default)s")
     sub.add_argument("--first-seed", type=int, default=TEST_FIRST, help="default: %(default)s")
     sub.add_argument("--json", type=Path, help="write every metric and episode to this file")

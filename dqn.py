@@ -78,8 +78,7 @@ class InputError(ValueError):
 
 
 def setting(default: Any, text: str, *legal: Any) -> Any:
-    """A field of a configuration: its default, what it is, and its least and greatest value, or the
-    allowed words."""
+    """A setting: its default, what it is, and its least and greatest value, or the legal words."""
     return field(default=default, metadata={"help": text, "legal": legal})
 
 

@@ -130,10 +130,6 @@ def test_weights_come_back_in_half_precision_with_their_world_and_kind(tmp_path:
     again, *rest = load_weights(path)
     assert rest == [env.World(beacon=True, camera="disparity"), "dqn"]
     assert all(map(torch.equal, again.parameters(), q.half().float().parameters()))
-    q.head[2].bias.data[0] = 1e5  # more than half precision can hold
-    save_weights(path, q, Config())
-    with pytest.raises(InputError, match="no finite numbers"):
-        load_weights(path)
 
 
 def test_on_a_full_disk_the_old_file_stays_and_nothing_else(tmp_path: Path) -> None:
@@ -177,9 +173,10 @@ def test_eval_prints_a_table_and_writes_json_and_a_film(
     assert main(["eval", "--episodes", "2", "--json", "out/r.json", "--out", "film"]) == 0
     out, error = capsys.readouterr()
     head, *rows, _, wrote = out.splitlines()[2:]
-    assert (head.split(), len(rows), error) == (["random", "straight", "dqn"], 6, "")
-    assert wrote.startswith("wrote film/flight.gif: forest 400000000")
-    with Image.open("film/flight.gif") as film:
+    assert (head.split(), len(rows)) == (["random", "straight", "dqn"], 6)
+    assert error == "flying straight\nflying dqn\n"
+    assert wrote.startswith("wrote film/dqn.gif: forest 400000000")
+    with Image.open("film/dqn.gif") as film:
         assert (film.info["duration"], film.info["loop"]) == (100, 0) and film.n_frames > 20
     pilots = json.loads(Path("out/r.json").read_text())["pilots"]
     assert [len(metrics["episodes"]) for metrics in pilots.values()] == [4, 2, 2]
@@ -197,7 +194,7 @@ import deepflight as d
 d.VALIDATION = range(10**9, 10**9 + 2)
 d.fly_random = lambda seeds, world: d.fly(d.env.straight_pilot, seeds, world)
 assert d.main("train --steps 80 --learning-starts 80".split()) == 0
-assert d.main("eval --episodes 1 --weights runs/001/best.pt".split()) == 0
+assert d.main("eval --episodes 1 --weights runs/001".split()) == 0
 """
 
 
@@ -206,6 +203,6 @@ def test_under_a_profiler_and_without_what_windows_lacks_train_and_eval_work(her
     words = [sys.executable, "-m", "cProfile", "-o", "profile", "windows.py"]
     path = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(words, env=path, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert (here / "runs/eval/flight.gif").stat().st_size > 1000
+    assert (done.returncode, done.stderr) == (0, "flying straight\nflying dqn\n")
+    assert (here / "runs/eval/001.gif").stat().st_size > 1000
     assert {"train", "evaluate"} <= {name for _, _, name in pstats.Stats("profile").stats}

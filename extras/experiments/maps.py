@@ -9,7 +9,8 @@ from render import Scene
 
 SCALE = 8  # px a metre
 MARGIN = 4.0  # m around the forest
-COLOURS = {"crash": "#d62728", "goal": "#2ca02c", "far": "#17a2b8", "": "#1f77b4"}  # else orange
+COLOURS = dict.fromkeys(("side", "back", "time"), "#e69f00")  # Okabe and Ito's palette
+COLOURS |= {"crash": "#d55e00", "goal": "#009e73", "far": "#56b4e9", "": "#0072b2"}
 
 
 def draw_map(trunks: ndarray, size: tuple[float, float], title: str = "") -> Image.Image:
@@ -24,8 +25,8 @@ def draw_map(trunks: ndarray, size: tuple[float, float], title: str = "") -> Ima
     draw.rectangle(corners, fill="#f2f2ea")
     for x, y in trunks:
         disc(image, x, y, Scene.trunk_radius, "#5b5b50")
-    disc(image, 0, 0, 0.8, "#1f77b4")
-    disc(image, length, 0, 1.6, "#2ca02c")
+    disc(image, 0, 0, 0.8, "#0072b2")
+    disc(image, length, 0, 1.6, "#009e73")
     draw.text((8, 4), title, fill="black", font_size=18)
     return image
 
@@ -35,7 +36,7 @@ def draw_ways(image: Image.Image, ways: Iterable[tuple[ndarray, str, str]]) -> I
     image, labels = image.copy(), []
     draw = ImageDraw.Draw(image)
     for path, outcome, label in ways:
-        colour = COLOURS.get(outcome, "#ff7f0e")
+        colour = COLOURS[outcome]
         draw.line([pixel(image, x, y) for x, y in path], fill=colour, width=3)
         disc(image, *path[-1], 0.7, colour)
         x, y = pixel(image, *path[-1])
