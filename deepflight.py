@@ -149,7 +149,8 @@ class Run:
         save(self.folder / "config.json", json.dumps(asdict(c), indent=2).encode())
         again = f'"{sys.executable}" {c.program}'
         with stop_signals() as stopped:
-            print(f"{c.steps:,} steps; all files are in {self.folder}\n\n{HEAD}", flush=True)
+            print(f"{c.steps:,} steps in {self.folder}; `python -m extras.cockpit` shows them live")
+            print(f"\n{HEAD}", flush=True)
             for _ in self.loop:
                 if not np.isfinite(self.agent.loss):
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")

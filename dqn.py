@@ -153,8 +153,7 @@ class QNetwork(nn.Module):
 
     @torch.no_grad()
     def values(self, s: ndarray, drones: Any) -> ndarray:
-        """Q(s, .) (E, A) of s (E, 4, 84, 84) uint8, for acting. drones: whose observations these
-        are; a lesson's network asks them for more."""
+        """Q(s, .) (E, A) of s (E, 4, 84, 84) uint8, for acting; lessons ask the drones for more."""
         return self(torch.from_numpy(s)).numpy()
 
 

@@ -184,7 +184,7 @@ def seen_from(pose: Sequence[float], points: ndarray) -> ndarray:
 
 def draw_panel(drone: Any, path: ndarray, q: ndarray, text: str) -> Image.Image:
     """One picture of a drone, see env.py: its frame, its path (T, 2) in m on a map of the trunks,
-    and what the network says of each action, q (A,), left turns on the left, the greatest red."""
+    and what the network says of each action, q (A,), left turns on the left, the greatest blue."""
     image = Image.new("RGB", (1248, 656), "#f4f4ee")  # px, twice too large: lines become smooth
     draw = ImageDraw.Draw(image)
     image.paste(Image.fromarray(drone.observation[-1]).resize((464, 464), Image.Resampling.NEAREST))
@@ -198,7 +198,7 @@ def draw_panel(drone: Any, path: ndarray, q: ndarray, text: str) -> Image.Image:
     draw.circle(tuple(path[-1]), 8, fill=colour)
     for a, value in enumerate(q):
         x, height = 8 + 50 * (len(q) - 1 - a), 120 * (value - q.min()) / max(np.ptp(q), 1e-9)
-        colour = "crimson" if value == q.max() else "gray"
+        colour = "royalblue" if value == q.max() else "gray"
         draw.rectangle([x, 608 - height, x + 42, 612], fill=colour)
     draw.text((496, 476), text, fill="black", font_size=34, spacing=8)
     return image.reduce(2).quantize(64, Image.Quantize.FASTOCTREE)

@@ -21,8 +21,8 @@ from extras.experiments.maps import COLOURS, draw_map, draw_ways
 
 ROOT = Path(__file__).parents[2]
 SHARES = 0.025, 0.075, 0.25, 1.0  # of the training's length, at which the four moments are
-ENDS = {"": "in the air", "crash": "hit a trunk", "goal": "arrived", "far": "far edge",
-        "side": "side edge", "back": "back edge", "time": "out of time"}  # fmt: skip
+ENDS = {"": "in the air", "crash": "hit a trunk", "goal": "arrived", "time": "out of time"}
+ENDS |= {side: f"left by the {side} edge" for side in ("far", "side", "back")}
 NEAREST = Image.Resampling.NEAREST
 
 
@@ -67,13 +67,15 @@ def all_ways(title: str, episodes: list[Episode], world: World) -> Image.Image:
     """Every way of a moment on one map; the trunks differ, and are left out."""
     plain = draw_map(np.empty((0, 2)), (world.length, world.width))
     image = draw_ways(plain, [(path(e, world), e["outcome"], "") for e in episodes])
-    draw, x = ImageDraw.Draw(image), 34
+    panel = headed(image.resize((480, 265)), title)
+    draw, x = ImageDraw.Draw(panel), 20.0
     for end in OUTCOMES:
         if count := sum(episode["outcome"] == end for episode in episodes):
-            text = f"{count} {ENDS[end]}"
-            draw.text((x, 404), text, fill=COLOURS[end], font_size=24)
-            x += draw.textlength(text, font_size=24) + 24
-    return headed(image.resize((480, 265)), title)
+            text = f"{count} {ENDS[end].removeprefix('left by the ')}"
+            draw.circle((x + 5, 29), 5, fill=COLOURS[end])
+            draw.text((x + 13, 21), text, fill="black", font_size=13)
+            x += draw.textlength(text, font_size=13) + 26
+    return panel
 
 
 def moment(drone: Drone, way: np.ndarray, title: str, world: World) -> Image.Image:
