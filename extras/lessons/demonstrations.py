@@ -3,7 +3,7 @@
     python -m extras.lessons.expert eval --first-seed 0 --episodes 32 --json demos.json
                                                       record the planner of expert.py
     python -m extras.lessons.demonstrations train --demos demos.json
-    python -m extras.lessons.demonstrations eval --weights runs/NAME/best.pt
+    python -m extras.lessons.demonstrations eval --weights runs/NAME
     python -m extras.lessons.demonstrations diff      its loop beside that of dqn.py
 
 **The question.** DQN begins with a network that knows nothing, so it crashes many times until it

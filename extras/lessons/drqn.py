@@ -1,7 +1,7 @@
 """drqn.py: can a network find out alone where it is? DRQN [Hausknecht 2015].
 
     python -m extras.lessons.drqn train
-    python -m extras.lessons.drqn eval --weights runs/001/best.pt
+    python -m extras.lessons.drqn eval --weights runs/001
 
 In memory.py we add up the drone's turns, and the network gets the sum. Here nobody adds. The
 network gets its four frames and the action that it took last, and it carries a **hidden state** h

@@ -2,7 +2,7 @@
 
     python -m extras.lessons.expert train             imitate a planner that has a laser
     python -m extras.lessons.expert train --bellman   and learn from TD targets too
-    python -m extras.lessons.expert eval --weights runs/NAME/best.pt
+    python -m extras.lessons.expert eval --weights runs/NAME
     python -m extras.lessons.expert diff              its loop beside that of dqn.py
 
 **The question.** DQN finds out by trial what an action is worth. Suppose that somebody knows it

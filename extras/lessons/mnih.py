@@ -3,7 +3,7 @@
     python -m extras.lessons.mnih train   his settings: 1.4 million steps as in [DF], 8 GB, hours
     python -m extras.lessons.mnih textbook train --steps 100000
                                           dqn.py with all [+] off except num_envs
-    python -m extras.lessons.mnih eval --weights runs/NAME/best.pt
+    python -m extras.lessons.mnih eval --weights runs/NAME
     python -m extras.lessons.mnih diff             its loop beside that of dqn.py
 
 **The question.** [DF] says that its algorithm is the one "proposed by Mnih et al.", and dqn.py adds

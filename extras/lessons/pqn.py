@@ -1,7 +1,7 @@
 """pqn.py: what if the replay and the target network go? PQN [Gallici 2025].
 
     python -m extras.lessons.pqn train
-    python -m extras.lessons.pqn eval --weights runs/001/best.pt
+    python -m extras.lessons.pqn eval --weights runs/001
     python -m extras.lessons.pqn plain train      the experiment: without normalized layers
     python -m extras.lessons.pqn diff             its loop beside that of dqn.py
 
@@ -51,7 +51,7 @@ and multiplications cheap, so there a replay is the better idea.
 
     three seeds   crossed, %         hit a trunk, %    return          steps     minutes
     pqn           59.4, 56.6, 56.4   3.8, 16.9, 5.2    106, 102, 110   500,000   17, 16, 16
-    dqn           65.6, 64.2, 66.9   2.0, 2.4, 1.6     64, 61, 54      200,000   45, 39, 41
+    dqn           65.6, 64.2, 66.9   2.0, 2.4, 1.6     64, 61, 54      200,000   34, 39, 41
 
 It is jumpy: 71 % of seed 0's validation episodes crashed at step 175,000, none at 200,000. After
 150,000 steps 58 % crossed with normalization and 31 % without (returns 72 and -4, one seed each),
