@@ -1,8 +1,8 @@
 """memory.py: what can four frames not know? Where the drone is.
 
     python -m extras.lessons.memory train
-    python -m extras.lessons.memory eval --weights runs/001/best.pt
-    python -m extras.lessons.memory drift eval --weights runs/001/best.pt    a gyroscope that drifts
+    python -m extras.lessons.memory eval --weights runs/001
+    python -m extras.lessons.memory drift eval --weights runs/001    a gyroscope that drifts
 
 Four frames span 0.3 s. They show trunks, but not which way the far edge is, and when an edge comes
 into view they hardly show which one it is. So a pilot of four frames turns away from edges that it
@@ -186,12 +186,12 @@ MemoryConfig = recipe(
 )  # fmt: skip
 
 
-def main() -> int:
-    """Memory, or after the word `drift` with gyroscopes that drift by 10 degrees a minute."""
+def main(config: type) -> int:
+    """The command line; after the word `drift` all gyroscopes drift by 10 degrees a minute."""
     drift = sys.argv[1:2] == ["drift"]
     QNetwork.drift = 10.0 if drift else 0.0
-    return run(MemoryConfig, sys.argv[1 + drift :])
+    return run(config, sys.argv[1 + drift :])
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(MemoryConfig))
