@@ -4,11 +4,11 @@
     .venv/bin/python -m extras.cockpit --port N     # at another port
 
 A web page on this machine, for this machine. It needs no package but the core's. episodes.py has
-the answers, and index.html, cockpit.js and cockpit.css are the page.
+the answers; index.html, cockpit.js, learning.js and cockpit.css are the page.
 
 Only the loopback listens. A request from another site's page is refused, because a browser says
 whose page asks (Origin), and to whom it believes to talk (Host). No text from the page becomes a
-path: weights are looked up by name in a list.
+path: weights and trainings are looked up by name in a list.
 
 Not here: encryption, users, other machines. Do not put this server on a network.
 """
@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 HOST, PORT, LARGEST = "127.0.0.1", 8642, 2**14  # LARGEST: bytes of a request's body
-PAGE = {"/": ("index.html", "text/html"), "/cockpit.js": ("cockpit.js", "text/javascript")}
-PAGE |= {"/cockpit.css": ("cockpit.css", "text/css")}
+PAGE = {"/": ("index.html", "text/html"), "/cockpit.css": ("cockpit.css", "text/css")}
+PAGE |= {f"/{name}": (name, "text/javascript") for name in ("cockpit.js", "learning.js")}
 HEADERS = {"X-Content-Type-Options": "nosniff", "Cache-Control": "no-store"}
 HEADERS["Content-Security-Policy"] = "default-src 'self'; img-src data:; frame-ancestors 'none'"
 
@@ -37,6 +37,7 @@ class Server(ThreadingHTTPServer):
         # Browsers leave port 80 out.
         self.lock, at = threading.Lock(), f":{self.server_port}".removesuffix(":80")
         self.answers = {"/options": hangar.options, "/fly": hangar.fly, "/why": hangar.why}
+        self.answers |= {"/trainings": hangar.trainings, "/training": hangar.training}
         self.ours = [f"http://{name}{at}" for name in (HOST, "localhost")]
 
     def handle_error(self, *args: Any) -> None:
@@ -77,7 +78,7 @@ class Handler(BaseHTTPRequestHandler):
             if not (answer := self.server.answers.get(self.path)):
                 return self.answer(404, "no such question")
             with self.server.lock:
-                content = json.dumps(answer(json.loads(body))).encode()
+                content = json.dumps(answer(json.loads(body)), allow_nan=False).encode()
         except ValueError as error:
             return self.answer(400, str(error))
         self.answer(200, content, "application/json")

@@ -1,4 +1,4 @@
-"""What the cockpit answers: episodes, what the network thinks of them, and why.
+"""What the cockpit answers: episodes, what the network thinks of them, and why; and how it learned.
 
 An answer is a function of the request alone. A request is a dictionary of texts. Its world,
 weights, seed and actions say which episode is meant, because seed and actions are all it takes to
@@ -13,11 +13,13 @@ Legend
 Not in this file: HTTP, which is in __main__.py, and the rules of the world, which are env.py's.
 """
 
+import csv
+import json
 import re
 from base64 import b64encode
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +29,14 @@ from numpy import ndarray
 
 from deepflight import TRAIN_END, Config, load_weights
 from dqn import InputError, QNetwork
-from env import STACK, Pilot, VecForest, World, random_pilot, straight_pilot
+from env import OUTCOMES, STACK, Pilot, VecForest, World, random_pilot, straight_pilot
 from extras.lessons.expert import laser_pilot
 from render import BEARINGS, draw_frame, seen_from
 
 ROOT = Path(__file__).parents[2]
 WORLDS = {"plain": World(), "beacon": World(beacon=True), "disparity": World(camera="disparity")}
+CURVES = ("return", "steps", "crossed", "crash")  # what the page draws of each validation
+BROKEN = (OSError, ValueError, TypeError, KeyError, csv.Error)  # what a foreign file raises
 
 
 class Recording(VecForest):
@@ -70,7 +74,8 @@ PILOTS |= {"straight": straight_pilot}
 # What may be asked, as patterns.
 LEGAL = dict.fromkeys(("more", "since", "time"), "[0-9]{1,4}")
 LEGAL |= {"world": "|".join(WORLDS), "pilot": "|".join(PILOTS), "seed": "[0-9]{1,18}"}
-LEGAL |= {"weights": ".{1,300}", "actions": f"[0-{World.num_actions - 1}]{{0,{World.max_steps}}}"}
+LEGAL |= dict.fromkeys(("weights", "name"), ".{1,300}")
+LEGAL |= {"actions": f"[0-{World.num_actions - 1}]{{0,{World.max_steps}}}"}
 
 
 def check(ask: Any, keys: str) -> None:
@@ -90,8 +95,40 @@ def read_network(path: Path, _changed: int) -> tuple[QNetwork, World, str]:
     return q.requires_grad_(False), world, pilot
 
 
+def settings(folder: Path) -> dict[str, Any]:
+    """Of a training, without those that leave its curve comparable; {} if they cannot be read."""
+    with suppress(*BROKEN):
+        found = dict(json.loads((folder / "config.json").read_text()))
+        return {key: value for key, value in found.items() if key not in ("seed", "threads")}
+    return {}
+
+
+def read_log(folder: Path) -> list[dict[str, float]]:
+    """What each validation of a training came to."""
+    with (folder / "log.csv").open() as file:
+        return [{"step": int(row["step"]), "minutes": float(row["seconds"]) / 60}
+                | {key: float(row[f"validation_{key}"]) for key in CURVES}
+                for row in csv.DictReader(file)]  # fmt: skip
+
+
+@lru_cache(1)  # the page asks every two seconds
+def read_training(folder: Path, _changed: int) -> list[dict[str, Any]]:
+    """The same with the episodes. The log is written first: its last row may have none yet."""
+    flown: dict[int, list] = {}
+    for line in (folder / "validation.jsonl").read_text().splitlines():
+        x = json.loads(line)
+        if x["outcome"] not in OUTCOMES or not re.fullmatch(LEGAL["actions"], x["actions"]):
+            raise ValueError(f"no such episode: {line[:80]}")
+        kept = {"seed": int(x["seed"]), "steps": int(x["steps"]), "return": float(x["return"])}
+        flown.setdefault(x["step"], []).append(
+            {**kept, "actions": x["actions"], "outcome": x["outcome"]}
+        )
+    return [x | {"episodes": flown[x["step"]]} for x in read_log(folder) if x["step"] in flown]
+
+
 class Hangar:
-    """The networks in two folders, and the last episodes. One thread at a time may ask it."""
+    """The networks and trainings in two folders each, and the last episodes. One thread at a time
+    may ask it."""
 
     def __init__(self, root: Path = ROOT) -> None:
         torch.set_num_threads(1)  # more gain nothing on so few frames
@@ -172,6 +209,41 @@ class Hangar:
             for i, q, other in zip(changed, after, rest, strict=True)
         ]  # fmt: skip
         return {"before": before, "chosen": chosen, "without": reasons}
+
+    def folders(self) -> dict[str, Path]:
+        """Those of trainings that keep their validation episodes, the latest run first."""
+        logs = [*self.root.glob("runs/*/log.csv"), *self.root.glob("results/**/log.csv")]
+        found = [path.parent for path in logs if path.with_name("validation.jsonl").exists()]
+        return {x.relative_to(self.root).as_posix(): x for x in sorted(found, reverse=True)}
+
+    def trainings(self, ask: Any) -> list[dict[str, str]]:
+        """Those in a known world. weights: of the final network, "" if it is not here."""
+        check(ask, "")
+        worlds, found = {(w.beacon, w.camera): name for name, w in WORLDS.items()}, []
+        for name, folder in self.folders().items():
+            with suppress(*BROKEN):
+                c, weights = settings(folder), name.removeprefix("results/")
+                world = worlds[c["beacon"], c["camera"]]
+                there = weights if weights in self.networks(world) else ""
+                found.append({"name": name, "world": world, "weights": there})
+        return found
+
+    def training(self, ask: Any) -> dict[str, Any]:
+        """The validations of a training from number `since`, and how many there are. The band: the
+        least and greatest values of the committed trainings that differ in the seed alone."""
+        check(ask, "name since")
+        if not (folder := self.folders().get(ask["name"])):
+            raise ValueError(f"there is no training {ask['name']!r} with validation episodes")
+        try:
+            rows = read_training(folder, (folder / "validation.jsonl").stat().st_mtime_ns)
+            others = [x.parent for x in self.root.glob("results/**/log.csv") if x.parent != folder]
+            logs = [read_log(x) for x in others if settings(x) == settings(folder)]
+        except BROKEN as error:
+            raise ValueError(f"the training {ask['name']} cannot be read: {error!r}") from None
+        band = [{key: [f(row[key] for row in rows) for f in (min, max)] for key in rows[0]}
+                for rows in zip(*logs, strict=False)]  # fmt: skip
+        return {"validations": rows[int(ask["since"]) :], "count": len(rows), "band": band,
+                "others": len(logs)}  # fmt: skip
 
 
 def without(poses: ndarray, recording: Recording) -> tuple[list[int], ndarray]:
