@@ -1,14 +1,24 @@
 "use strict";
 // The page of the cockpit. It shows what the server answers, and knows no rule of the world.
 // An episode has moments; each has pose, reward, return, d_obs, q, and a frame.
+// learning.js is the other view, of a training.
 
 const $ = (id) => document.getElementById(id);
-const PIXELS = 84;
+const [PIXELS, NEAR] = [84, 2.5]; // NEAR: m, from the pointer to what it means
 const ENDS = {
-  crash: "crashed into a trunk", goal: "arrived at the goal", far: "crossed: left by the far edge",
-  side: "left by a side", back: "left by the back", time: "out of time",
+  goal: "arrived", far: "left by the far edge", side: "left by a side", back: "left by the back",
+  crash: "hit a trunk", time: "ran out of time",
 };
-const MEANING = { beacon: "A pole stands at the goal, and can be seen.", disparity: "The frames show how near things are." };
+const MEANING = {
+  you: "You steer.", network: "The network chosen at the right.", random: "Any turn, each as likely.", straight: "Never turns.",
+  laser: "A planner that measures where the trunks are. It knows more than the camera shows.",
+  plain: "The paper's world. Nothing marks the goal.", beacon: "A pole stands at the goal, and can be seen.",
+  disparity: "The frames show how near things are.",
+};
+const RECORDED = "recorded"; // the pilot of a training's validation episode, which is whole from the start
+const CHIPS = 6; // reasons in words
+const touch = matchMedia("(pointer: coarse)").matches;
+const [ARROWS, SPACE, GO] = touch ? ["◀ left or right ▶", "Play", "Play"] : ["← or →", "space", "Space or Play"];
 let options; // what one may choose from, and the numbers of each world
 let chosen = {}; // world, weights, seed, pilot
 let episode = null; // the episode on show: choice, moments, record, actions, trunks
@@ -17,7 +27,9 @@ let t = 0; // the moment on show
 let [reasons, removed] = [null, null]; // the answer to "why" of moment t; what is taken out on show
 let [playing, underway] = [false, null]; // underway: the promise of a step that the server has not answered
 let [generation, asked] = [0, 0]; // of episodes, and of what was asked: what an older one waited for is dropped
-const done = new Map(JSON.parse(sessionStorage.done || "[]")); // flown by hand to their end, each once
+let kept = {}; // a browser may refuse storage; then a reload forgets what was flown by hand
+try { kept = sessionStorage; } catch {}
+const done = new Map(JSON.parse(kept.done || "[]")); // flown by hand to their end, each once
 const stick = { held: {}, tapped: {}, side: 0, level: 0 };
 
 const world = () => options.worlds[chosen.world];
@@ -27,9 +39,12 @@ const ended = ({ record: { outcome } }) => ENDS[outcome];
 const isQ = () => world().weights[chosen.weights] === "dqn"; // an imitated network scores, and knows no return
 const score = () => (isQ() ? "Q" : "score");
 const byHand = () => chosen.pilot === "you";
+const recorded = () => chosen.pilot === RECORDED;
+const who = () => (recorded() ? `after ${thousands(chosen.step)} steps` : chosen.pilot);
 const steers = () => byHand() && t === end() && !over();
 const straight = () => (world().num_actions - 1) / 2;
 const number = (x) => (Math.round(10 * x) / 10 || 0).toFixed(1).replace("-", "−"); // never −0.0
+const thousands = (x) => Number(x).toLocaleString("en");
 const clock = (moment) => `${(moment * world().dt).toFixed(1)} s`;
 const signed = (x) => (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).replace(/^0/, "");
 const rate = (action) => signed(world().yaw_rate * (action / straight() - 1)); // rad/s
@@ -37,7 +52,7 @@ const inWords = (a) => (a === straight() ? "flies straight on" : `turns ${a > st
 const crossed = ({ record: { outcome } }) => outcome === "goal" || outcome === "far";
 const set = (node, values) => Object.entries(values).forEach(([key, x]) => node.setAttribute(key, x)) || node;
 const say = (text) => void ($("hint").textContent === text || ($("hint").textContent = text)); // read aloud once
-const writeAddress = () => history.replaceState(null, "", `#${new URLSearchParams({ ...episode.choice, t, actions: episode.actions })}`);
+const writeAddress = () => history.replaceState(null, "", `#${new URLSearchParams(learning() ? place : { ...episode.choice, t, actions: episode.actions })}`);
 
 // -------------------------------------------------- the server
 async function post(path, content) {
@@ -61,7 +76,7 @@ async function attempt(action) {
     await action();
     return true;
   } catch (error) {
-    pause();
+    if (playing) pause();
     say(error instanceof TypeError ? `The server does not answer: ${error.message}` : error.message);
   }
 }
@@ -79,8 +94,8 @@ async function begin(actions, moment) {
   setReasons(null);
   show(Math.min(moment || 0, end()));
   help();
-  if (!byHand() && moment === null) play();
-  while (!byHand() && !over()) {
+  if (!byHand() && moment === null && !learning()) play();
+  while (!byHand() && !recorded() && !over()) {
     await extend(found, found.actions, 25, chosen.pilot);
     if (me !== generation) return;
     show(playing || t >= moment ? t : Math.min(moment, end()));
@@ -94,10 +109,13 @@ async function begin(actions, moment) {
 
 // What one can do now.
 function help() {
-  if (playing) say(steers() ? "Hold ← or → to turn harder. Space pauses." : "");
-  else if (!steers()) say("Drag the time line. Click a trunk or a bar to ask the network. Or take over, and do better.");
-  else if (t) say("You have the controls: ← or → fly on from here, space flies straight on.");
-  else say("Press ← or → to take off. Hold to turn harder. The network flies along as a ghost.");
+  if (learning()) say(touch ? "Tap a way to fly that episode, or a curve to go there." : "← and → go through the training. Click a way to fly that episode.");
+  else if (!episode) return;
+  else if (playing && recorded()) say(`${chosen.training}, ${who()} of training. Learning goes back to all episodes.`);
+  else if (playing) say(steers() ? `Hold ${ARROWS} to turn harder. ${touch ? "Pause" : "Space"} pauses.` : "");
+  else if (!steers()) say(`Press ${GO}, or drag the time line. Click a trunk or a bar to ask the network. Or take over, and do better.`);
+  else if (t) say(`You have the controls: ${ARROWS} fly on from here, ${SPACE} flies straight on.`);
+  else say(`Press ${ARROWS} to take off. Hold to turn harder. The network flies along as a ghost.`);
 }
 
 async function steer() {
@@ -111,7 +129,7 @@ async function steer() {
   if (mine === asked) help();
   if (!over()) return;
   pause();
-  say(`You: ${ended(episode)}. R flies this forest again, N the next one. Or drag the time line, and ask why.`);
+  say(`You: ${ended(episode)}. ${touch ? "Again flies this forest again, Next" : "R flies this forest again, N"} the next one. Or drag the time line, and ask why.`);
 }
 
 function turn() {
@@ -128,7 +146,7 @@ function hold(side, down) {
   stick.held[side] = down ? 1 : 0;
   if (!down) return;
   if (!steers()) pause(); // what was asked is dropped
-  if (!steers()) return say("To steer, go to a moment before the end and press Take over here. Or press R: the forest again.");
+  if (!steers()) return say("To steer, go to a moment before the end and press Take over here. Or press Again.");
   stick.tapped[side] = 1;
   play();
 }
@@ -156,7 +174,7 @@ async function whatIf(action) {
 function compare(other, known = "") {
   ghost = other;
   show(other.from);
-  say(`${known}${other.words}: ${ended(other)}, total reward ${number(other.record.return)}. Esc, or the same bar, takes it away.`);
+  say(`${known}${other.words}: ${ended(other)}, return ${number(other.record.return)}. Esc, or the same bar, takes it away.`);
 }
 
 function clear() {
@@ -171,7 +189,7 @@ async function wentWrong() {
   const [me, steps] = [await settle(), Math.round(0.5 / world().dt)];
   if (me !== asked) return;
   if (!over()) return say("This episode is not over. Fly it to its end first.");
-  if (crossed(episode)) return say(`Nothing went wrong: ${ended(episode)}.`);
+  if (crossed(episode)) return say(`Nothing went wrong: the drone ${ended(episode)}.`);
   let from = end();
   while (from >= steps && from > end() - 10 * steps) {
     from -= steps;
@@ -203,15 +221,28 @@ async function why(trunk = null) {
 function setReasons(answer, trunk = null) {
   const things = answer ? [...answer.without].sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight)) : [];
   [reasons, removed] = [answer, things.find((x) => x.trunk === trunk) || null];
-  $("answer").hidden = !answer;
-  $("turn").textContent = answer ? rate(answer.chosen) : "";
-  $("things").replaceChildren();
-  for (const x of things.slice(0, 8)) {
-    const name = x.trunk < 0 ? "the goal's pole" : `trunk ${whereabouts(episode.trunks[x.trunk])}`;
-    const button = addButton($("things"), `${name} ${signed(x.weight)}`, () => attempt(() => why(x.trunk)));
+  const [mine, all] = answer ? [answer.before[answer.chosen], mean(answer.before)] : [];
+  $("answer").innerHTML = !answer ? "" : `<p>The network ${inWords(answer.chosen)}: this ${score()} is ${signed(mine - all)} from the mean of the nine. How much of
+    that goes if one trunk is not there? <b class="for">+ is a reason for</b> the turn, <b class="against">− is a reason against</b> it.</p><div></div>`;
+  for (const x of things.slice(0, CHIPS)) {
+    const name = x.trunk < 0 ? "the goal's pole" : whereabouts(episode.trunks[x.trunk]);
+    const button = addButton($("answer").lastChild, `${name} ${signed(x.weight)}`, () => attempt(() => why(x.trunk)));
     set(button, { class: x.weight > 0 ? "for" : "against", "aria-pressed": x === removed });
   }
+  $("marks").innerHTML = things.slice(0, CHIPS).map(outline).join("");
   drawTrunks();
+}
+
+const kind = (x) => (x === removed ? "removed" : x.weight > 0 ? "for" : "against");
+
+// Where a thing stands in the newest frame: around the pixels that change without it.
+function outline(x) {
+  const [before, after] = [episode.moments[t].frame, x.frame].map(atob);
+  const changed = [...before].flatMap((pixel, i) => (pixel === after[i] ? [] : [i]));
+  const [columns, rows] = [changed.map((i) => i % PIXELS), changed.map((i) => Math.floor(i / PIXELS))];
+  const [left, top] = [Math.min(...columns), Math.min(...rows)];
+  const size = `width="${Math.max(...columns) - left + 1}" height="${Math.max(...rows) - top + 1}"`;
+  return changed.length ? `<rect class="${kind(x)}" x="${left}" y="${top}" ${size}/>` : "";
 }
 
 function whereabouts([x, y]) {
@@ -220,12 +251,14 @@ function whereabouts([x, y]) {
   return `${Math.hypot(x - px, y - py).toFixed(0)} m off, ${Math.abs(left).toFixed(1)} m ${left > 0 ? "left" : "right"}`;
 }
 
+const pointed = (event, map) => new DOMPoint(event.clientX, event.clientY).matrixTransform(map.getScreenCTM().inverse());
+
 function clickMap(event) {
-  const place = new DOMPoint(event.clientX, event.clientY).matrixTransform($("map").getScreenCTM().inverse());
+  const place = pointed(event, $("map"));
   const things = episode.trunks.map((trunk, i) => [i, trunk]);
   if (world().beacon) things.push([-1, [world().length, 0]]);
   const far = things.map(([i, [x, y]]) => [Math.hypot(x - place.x, y + place.y), i]).sort((a, b) => a[0] - b[0]);
-  if (far[0][0] < 2.5) attempt(() => why(far[0][1]));
+  if (far[0][0] < NEAR) attempt(() => why(far[0][1]));
 }
 
 // -------------------------------------------------- play
@@ -243,7 +276,7 @@ async function settle() {
 function setPlaying(on) {
   [playing, asked] = [on, asked + 1];
   $("play").textContent = on ? "Pause" : "Play";
-  if (episode) help();
+  help();
   if (on) attempt(loop);
 }
 
@@ -270,16 +303,21 @@ function show(moment) {
   t = moment;
   const { choice, record } = episode;
   const name = `${choice.world} ${record.seed} ${record.actions}`;
-  if (choice.pilot === "you" && over()) sessionStorage.done = JSON.stringify([...done.set(name, { world: choice.world, ...record })]);
+  if (choice.pilot === "you" && over()) kept.done = JSON.stringify([...done.set(name, { world: choice.world, ...record })]);
   draw();
 }
 
 // -------------------------------------------------- drawing
+// The empty forest of a map.
+function drawGround(map, { length, width, back, goal_radius }) {
+  set(map, { viewBox: `${-back - 1} ${-width / 2 - 1} ${length + back + 5} ${width + 2}` });
+  set(map.querySelector(".ground"), { x: -back, y: -width / 2, width: length + back, height: width });
+  set(map.querySelector(".goal"), { cx: length, r: goal_radius });
+}
+
 function drawForest() {
-  const { length, width, back, num_actions, beacon } = world();
-  set($("map"), { viewBox: `-4 ${-width / 2 - 2} ${length + 8} ${width + 4}` });
-  set($("ground"), { x: -back, y: -width / 2, width: length + back, height: width });
-  set($("goal"), { cx: length });
+  const { length, num_actions, beacon } = world();
+  drawGround($("map"), world());
   set($("pole"), { cx: length, r: beacon ? 0.7 : 0 });
   const circle = ([cx, y]) => set(document.createElementNS("http://www.w3.org/2000/svg", "circle"), { cx, cy: -y });
   $("trunks").replaceChildren(...episode.trunks.map(circle));
@@ -297,7 +335,7 @@ function draw() {
   $("time").value = t;
   set($("time"), { "aria-valuetext": clock(t) });
   $("clock").textContent = `${clock(t)} of ${clock(end())}`;
-  const banner = t === end() && over() && `${ended(episode)}, total reward ${number(episode.record.return)}`;
+  const banner = t === end() && over() && `${ended(episode)}, return ${number(episode.record.return)}`;
   $("banner").textContent = removed ? `without ${removed.trunk < 0 ? "the goal's pole" : "this trunk"} (Esc puts it back)` : banner || "";
 }
 
@@ -321,7 +359,7 @@ function drawMap() {
   set($("ghost-path"), { points: path(known) });
   const at = ghost && ghost.moments[Math.min(t, ghost.moments.length - 1)].pose;
   set($("ghost"), { transform: at ? place(at) : "translate(-99 0)" });
-  [$("main-name").textContent, $("ghost-name").textContent] = [chosen.pilot, ghost ? ghost.label : ""];
+  [$("main-name").textContent, $("ghost-name").textContent] = [who(), ghost ? ghost.label : ""];
   $("ghost-mark").hidden = !ghost;
 }
 
@@ -330,45 +368,56 @@ function drawTrunks() {
   const most = Math.max(...[...found.values()].map((x) => Math.abs(x.weight)), 1e-9);
   const colour = (node, x, r) => {
     const share = x ? Math.abs(x.weight) / most : 0;
-    const kind = !x ? "" : x === removed ? "removed" : x.weight > 0 ? "for" : "against";
-    set(node, { class: kind, r: r * (1 + share), "fill-opacity": x ? 0.3 + 0.7 * share : 1 });
+    set(node, { class: x ? kind(x) : node.id, r: r * (1 + share), "fill-opacity": x ? 0.3 + 0.7 * share : 1 });
   };
   colour($("goal"), found.get(-1), world().goal_radius);
   [...$("trunks").children].forEach((circle, i) => colour(circle, found.get(i), 1.2 * world().trunk_radius));
 }
 
+const mean = (values) => values.reduce((sum, x) => sum + x) / values.length;
+const above = (values) => values.map((x) => x - mean(values));
+
 function drawBars() {
   const [q, other] = [episode.moments[t].q, removed && removed.q];
-  const [low, high] = [Math.min(...q, ...(other || q)), Math.max(...q, ...(other || q))];
-  const height = (x) => `${(100 * (x - low)) / Math.max(high - low, 1e-9)}%`;
+  const [own, without] = [above(q), above(other || q)];
+  const reach = 2 ** Math.ceil(Math.log2(Math.max(0.1, ...own.map(Math.abs), ...without.map(Math.abs))));
+  const stretch = ({ style }, x) => ([style.top, style.height] = [`${50 - (50 * Math.max(x, 0)) / reach}%`, `${(50 * Math.abs(x)) / reach}%`]);
+  $("scale").textContent = `line: the mean, ${number(mean(q))}; frame: ±${reach}`;
   [...$("bars").children].forEach((bar, i) => {
     const a = q.length - 1 - i; // the sharpest left turn stands leftmost
-    const [value, { children: [before, without] }, , after] = bar.children;
-    [value.textContent, after.textContent] = [number(q[a]), other ? number(other[a]) : ""];
-    [before.style.height, without.style.height, without.hidden] = [height(q[a]), height(other ? other[a] : low), !other];
+    const [value, { children: [first, second] }, , after] = bar.children;
+    [value.textContent, after.textContent, second.hidden] = [number(q[a]), other ? number(other[a]) : "", !other];
+    stretch(first, own[a]);
+    stretch(second, without[a]);
     bar.classList.toggle("best", q[a] === Math.max(...q));
     bar.classList.toggle("flown", episode.actions[t] === String(a));
     set(bar, { "aria-label": `${rate(a)} radians a second: ${score()} ${number(q[a])}. What if it turned so?` });
   });
 }
 
+// A line through points [x, y], x from 0 to 1, with a cursor, over a band of [x, least, greatest].
+function curve(name, value, line, cursor, band = []) {
+  const ys = [...line, ...band].flatMap(([, ...y]) => y);
+  const [low, high] = [Math.min(0, ...ys), Math.max(1, ...ys)];
+  const place = ([x, y]) => `${(100 * x).toFixed(2)} ${(30 - (30 * (y - low)) / (high - low)).toFixed(2)}`;
+  const path = (kind, points) => (points.length ? `<path class="${kind}" d="M${points.map(place).join("L")}"/>` : "");
+  const around = [...band, ...band.map(([x, , greatest]) => [x, greatest]).reverse()];
+  const paths = [path("band", around), path("line", line), path("cursor", [[cursor, low], [cursor, high]])].join("");
+  return `<div class="curve"><span>${name} <b>${number(value)}</b></span><svg viewBox="0 0 100 30" preserveAspectRatio="none"
+    aria-hidden="true">${paths}</svg><small><i>${number(high)}</i><i>${number(low)}</i></small></div>`;
+}
+
 function drawCurves() {
-  const curve = ([key, name]) => {
-    const values = episode.moments.map((moment) => moment[key]);
-    const [low, high] = [Math.min(0, ...values), Math.max(1, ...values)];
-    const x = (moment) => ((100 * moment) / Math.max(end(), 1)).toFixed(2);
-    const points = values.map((value, moment) => `${x(moment)} ${(30 - (30 * (value - low)) / (high - low)).toFixed(2)}`);
-    return `<div class="curve"><span>${name} <b>${number(values[t])}</b></span><svg viewBox="0 0 100 30" preserveAspectRatio="none"
-      aria-hidden="true"><path d="M${points.join("L")}"/><path d="M${x(t)} 0V30"/></svg></div>`;
-  };
-  const curves = { reward: "reward", return: "total reward", d_obs: "nearest trunk, m" };
-  $("curves").innerHTML = Object.entries(curves).map(curve).join("");
+  const share = (moment) => moment / Math.max(end(), 1);
+  const line = (key) => episode.moments.map((moment, i) => [share(i), moment[key]]);
+  const names = Object.entries({ reward: "reward", return: "return so far", d_obs: "nearest trunk, m" });
+  $("curves").innerHTML = names.map(([key, name]) => curve(name, episode.moments[t][key], line(key), share(t))).join("");
 }
 
 function drawTable() {
-  const episodes = [{ ...episode, label: chosen.pilot }, ghost].filter(Boolean);
+  const episodes = [{ ...episode, label: who() }, ghost].filter(Boolean);
   const known = (f) => ended(f) && (over() || f.whole);
-  const rows = { end: ended, steps: (f) => f.record.steps, "total reward": (f) => number(f.record.return) };
+  const rows = { end: ended, steps: (f) => f.record.steps, return: (f) => number(f.record.return) };
   const line = (name, cell) => `<tr><th scope="row">${name}</th>${episodes.map((f) => `<td>${cell(f)}</td>`).join("")}</tr>`;
   const body = Object.entries(rows).map(([name, cell]) => line(name, (f) => (known(f) ? cell(f) : "…")));
   $("table").innerHTML = line("", (f) => `<b>${f.label}</b>`) + body.join("");
@@ -384,6 +433,7 @@ function addButton(parent, text, action) {
 
 async function choose(change, actions = "", moment = null) {
   const after = (chosen = { ...chosen, ...change });
+  if (recorded() && !actions) chosen.pilot = "network"; // in another forest
   chosen.weights ||= Object.keys(world().weights)[0];
   drawChoices();
   const well = await attempt(() => begin(actions, moment));
@@ -413,6 +463,13 @@ async function restore() {
   const first = { pilot: "you", world: Object.keys(options.worlds)[0], seed: told.seed || "1", weights: told.weights };
   if (options.pilots.includes(told.pilot)) first.pilot = told.pilot;
   if (told.world in options.worlds && Object.keys(options.worlds[told.world].weights).length) first.world = told.world;
+  if (told.training) place = { training: told.training, step: told.step };
+  if (told.pilot === RECORDED && told.training && told.step > 0) Object.assign(first, place, { pilot: RECORDED });
+  if (told.training && !told.seed) {
+    if (!episode) chosen = first;
+    return attempt(openLearning);
+  }
+  setView(false);
   if (await choose(first, told.actions, Math.trunc(Math.abs(Number(told.t))) || 0) || episode) return;
   const wrong = $("hint").textContent;
   if (await choose({ seed: "1", weights: "" })) say(wrong);
@@ -422,7 +479,7 @@ async function share() {
   pause();
   writeAddress();
   const copied = await navigator.clipboard.writeText(location.href).then(() => " It is copied.", () => "");
-  say(`The address of this page holds this episode at this moment.${copied} It opens where a cockpit runs at ${location.host}.`);
+  say(`The address of this page holds ${learning() ? "this training at this validation" : "this episode at this moment"}.${copied} It opens where a cockpit runs at ${location.host}.`);
 }
 
 function save() {
@@ -446,11 +503,12 @@ const actions = {
   back: () => stepTo(t - 1),
   step: () => stepTo(t + 1),
   next: () => choose({ seed: String(BigInt(chosen.seed) + 1n) }),
-  again: () => choose({}),
+  again: () => choose({}, recorded() ? episode.actions : ""),
   random: () => choose({ seed: String(Math.floor(Math.random() * options.train_end)) }),
   why: () => attempt(() => why()),
   take: () => choose({ pilot: "you" }, episode.actions.slice(0, over() ? Math.min(t, end() - 1) : t), t),
   wrong: () => attempt(wentWrong),
+  learning: () => attempt(openLearning), flying: openFlying, sooner: () => goTo(at - 1), later: () => goTo(at + 1),
   clear, share, save,
 };
 const KEYS = { " ": "play", ",": "back", ".": "step", n: "next", r: "again", w: "why", Escape: "clear" };
@@ -461,7 +519,9 @@ function key(event) {
   const own = event.target.matches("input, select") || (name === " " && event.target.matches("button"));
   const [side, action] = [SIDES[name], actions[KEYS[name]]];
   if (side && event.type === "keyup") hold(side, false); // whatever has the focus
-  if (own || event.ctrlKey || event.metaKey || event.altKey || !episode || !(side || action)) return;
+  if (own || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (learning()) return learningKey(event);
+  if (!episode || !(side || action)) return;
   event.preventDefault();
   if (event.type === "keyup") return;
   if (side && !event.repeat) hold(side, true);
@@ -475,16 +535,17 @@ function listen() {
   window.addEventListener("hashchange", restore);
   document.addEventListener("visibilitychange", () => document.hidden && (release(), pause()));
   // What was clicked by a mouse would keep the focus, and take the keys that steer.
-  document.addEventListener("click", (event) => event.detail && event.target.matches("button, #time") && event.target.blur());
+  document.addEventListener("click", (event) => event.detail && event.target.matches("button, [type=range]") && event.target.blur());
   for (const side of ["left", "right"]) {
     on(side, "pointerdown", () => hold(side, true));
     for (const name of ["pointerup", "pointerleave", "pointercancel"]) on(side, name, () => hold(side, false));
   }
-  for (const [name, action] of Object.entries(actions)) if ($(name)) on(name, "click", () => episode && action());
+  for (const [name, action] of Object.entries(actions)) if ($(name)) on(name, "click", () => (episode || learning()) && action());
   on("map", "click", clickMap);
+  listenLearning(on);
   on("time", "input", () => stepTo(Number($("time").value)));
   on("seed", "change", () => choose({ seed: $("seed").value.trim() }));
-  on("weights", "change", () => choose({ weights: $("weights").value }));
+  on("weights", "change", () => choose({ weights: $("weights").value }, recorded() ? episode.actions : ""));
   for (const id of ["seed", "weights", "hold", "speed"]) on(id, "change", () => $(id).blur());
 }
 
@@ -493,5 +554,5 @@ attempt(async () => {
   listen();
   await restore();
   // Not at each change, because browsers complain if the address changes many times a second.
-  setInterval(() => episode && !playing && writeAddress(), 500);
+  setInterval(() => (learning() ? training : episode && !playing) && writeAddress(), 500);
 });

@@ -1,13 +1,16 @@
 """The cockpit says what env.py, render.py and dqn.py say, and no request breaks it."""
 
+import csv
 import json
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 from base64 import b64decode
 from collections.abc import Iterator
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from http.client import HTTPConnection
 from pathlib import Path
 
@@ -15,9 +18,9 @@ import numpy as np
 import pytest
 import torch
 
-from deepflight import Config, dqn_pilot, load_weights, save_weights
+from deepflight import Config, dqn_pilot, load_weights, measure, save, save_weights
 from dqn import QNetwork
-from env import Pilot, World, fly, refly, straight_pilot
+from env import Episode, Pilot, World, fly, refly, straight_pilot
 from extras.cockpit.__main__ import LARGEST, Server
 from extras.cockpit.episodes import ROOT, Hangar
 from extras.lessons.expert import laser_pilot
@@ -27,13 +30,19 @@ HOMES = {"plain": "dqn", "beacon": "dqn-beacon"}
 SEED, FIRST = 1, {"world": "plain", "weights": "dqn", "seed": "1"}
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    server = Server(0, Hangar())
+@contextmanager
+def running(hangar: Hangar) -> Iterator[Server]:
+    server = Server(0, hangar)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield server
     server.shutdown()
     server.server_close()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with running(Hangar()) as server:
+        yield server
 
 
 def shipped(world: str) -> tuple[QNetwork, World]:
@@ -165,6 +174,134 @@ def test_the_page_learns_which_weights_imitate(server: Server) -> None:
         assert named[name] == name.split("-")[0]
 
 
+def keep_training(folder: Path, flown: dict[int, list[Episode]], **settings: object) -> None:
+    """Write what a training keeps: flown holds the episodes of each validation, by its step."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.json").write_text(json.dumps(asdict(Config(**settings))))
+    rows = [
+        {"step": step, "seconds": 0.012 * step}
+        | {f"validation_{key}": float(x.mean()) for key, x in measure(episodes).items()}
+        for step, episodes in flown.items()
+    ]
+    lines = [rows[0].keys(), *(row.values() for row in rows)]
+    save(folder / "log.csv", "".join(",".join(map(str, x)) + "\n" for x in lines).encode())
+    lines = [{"step": step} | episode for step, episodes in flown.items() for episode in episodes]
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    save(folder / "validation.jsonl", text.encode())
+
+
+def network_episodes() -> list[Episode]:
+    """A thousand that the shipped network flew: they end in many ways."""
+    report = json.loads((ROOT / "results/dqn.json").read_text())
+    return report["pilots"]["dqn"]["episodes"]
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A training with the default settings, beside committed ones, and foreign folders."""
+    some = network_episodes()
+    keep_training(tmp_path / "runs/mine", {5_000: some[:6], 10_000: some[6:12]}, seed=7, threads=2)
+    for name in ("dqn", "dqn-1", "dqn-2", "dqn-beacon"):
+        shutil.copytree(ROOT / "results" / name, tmp_path / "results" / name)
+    (tmp_path / "weights").mkdir()
+    save_weights(tmp_path / "weights/dqn-9.pt", QNetwork(9), Config(beacon=True))
+    return tmp_path
+
+
+def test_trainings_are_listed_with_their_worlds_and_final_networks(root: Path) -> None:
+    some = {5_000: network_episodes()[:2]}
+    keep_training(root / "results/dqn-9", some, beacon=True)
+    keep_training(root / "results/ladder/3-0", some)
+    keep_training(root / "runs/odd", some, beacon=True, camera="disparity")
+    save_weights(root / "runs/mine/best.pt", QNetwork(9), Config())
+    for name, text in {"none": "", "list": "[1]", "half": '{"beacon": fal', "keys": "{}"}.items():
+        keep_training(root / "runs" / name, some)
+        (root / "runs" / name / "config.json").write_text(text)
+    (root / "runs/bare").mkdir()
+    assert Hangar(root).trainings({}) == [
+        {"name": "runs/mine", "world": "plain", "weights": "runs/mine"},
+        {"name": "results/ladder/3-0", "world": "plain", "weights": ""},
+        {"name": "results/dqn-9", "world": "beacon", "weights": "dqn-9"},
+    ]
+    assert Hangar(root / "elsewhere").trainings({}) == []
+
+
+def test_a_training_is_told_from_any_validation_on(root: Path) -> None:
+    some, hangar = network_episodes(), Hangar(root)
+    whole = hangar.training({"name": "runs/mine", "since": "0"})
+    keys = ("seed", "actions", "outcome", "return", "steps")
+    told = [[{key: x[key] for key in keys} for x in some[i : i + 6]] for i in (0, 6)]
+    assert [row["episodes"] for row in whole["validations"]] == told
+    first = whole["validations"][0]
+    assert (first["step"], first["minutes"]) == (5_000, 1.0)
+    for key in ("return", "steps", "crossed", "crash"):
+        assert first[key] == measure(some[:6])[key].mean()
+    rest = hangar.training({"name": "runs/mine", "since": "1"})
+    assert rest == whole | {"validations": whole["validations"][1:]}
+    flown = {5_000: some[:6], 10_000: some[6:12], 15_000: some[12:18]}
+    keep_training(root / "runs/mine", flown, seed=7)
+    more = hangar.training({"name": "runs/mine", "since": "2"})
+    assert (more["count"], [x["step"] for x in more["validations"]]) == (3, [15_000])
+
+
+def test_a_log_that_is_ahead_of_its_episodes_waits_for_them(root: Path) -> None:
+    log = root / "runs/mine/log.csv"
+    *_, last = rows = log.read_text().splitlines()
+    log.write_text("\n".join([*rows, last.replace("10000", "15000")]) + "\n")
+    assert Hangar(root).training({"name": "runs/mine", "since": "0"})["count"] == 2
+
+
+def test_the_band_is_that_of_committed_trainings_that_differ_in_the_seed_alone(root: Path) -> None:
+    answer = Hangar(root).training({"name": "runs/mine", "since": "0"})
+    tables = []
+    for name in ("dqn", "dqn-1", "dqn-2"):
+        with (ROOT / "results" / name / "log.csv").open() as file:
+            tables.append(list(csv.DictReader(file)))
+    assert answer["others"] == len(tables)
+    assert [x["step"] for x in answer["band"]] == [[5_000 * i] * 2 for i in range(1, 41)]
+    for i, told in enumerate(answer["band"]):
+        for key in ("return", "steps", "crossed", "crash"):
+            values = [float(table[i][f"validation_{key}"]) for table in tables]
+            assert told[key] == [min(values), max(values)]
+    shutil.copy(root / "runs/mine/validation.jsonl", root / "results/dqn-1")
+    assert Hangar(root).training({"name": "results/dqn-1", "since": "0"})["others"] == 2
+    keep_training(root / "runs/mine", {5_000: network_episodes()[:6]}, gamma=0.9)
+    assert Hangar(root).training({"name": "runs/mine", "since": "0"})["band"] == []
+
+
+FLOWN, LOG = "validation.jsonl", "log.csv"
+BREAKS = {
+    "half a line": (FLOWN, lambda text: text[:-40]),
+    "no JSON": (FLOWN, lambda text: "hello\n"),
+    "no episode": (FLOWN, lambda text: "[]\n"),
+    "no such action": (FLOWN, lambda text: text.replace('"actions": "4', '"actions": "x')),
+    "no such end": (FLOWN, lambda text: text.replace('"outcome": "', '"outcome": "un')),
+    "no number": (FLOWN, lambda text: text.replace('"return": ', '"return": NaN, "x":')),
+    "no text": (FLOWN, lambda text: text.replace("{", "\udcff{")),
+    "half a row": (LOG, lambda text: text[: len(text) - 60]),
+    "no columns": (LOG, lambda text: "a,b\n1,2\n"),
+    "a folder": (LOG, None),
+}
+
+
+@pytest.mark.parametrize("case", BREAKS)
+def test_a_broken_training_is_a_line(root: Path, case: str, capfd: pytest.CaptureFixture) -> None:
+    name, change = BREAKS[case]
+    file = root / "runs/mine" / name
+    text = file.read_text()
+    file.unlink()
+    if change:
+        file.write_text(change(text), errors="surrogateescape")
+    else:
+        file.mkdir()
+    with running(Hangar(root)) as server:
+        code, text = request(server, "/training", '{"name": "runs/mine", "since": "0"}')
+        assert (code, text.count("\n")) == (400, 1), text
+        assert "runs/mine" in text or case == "no number"
+        assert ask(server, "/options")["worlds"]["beacon"]["weights"] == {"dqn-9": "dqn"}
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize("header", ["Host", "Origin"])
 def test_other_sites_are_refused(server: Server, header: str) -> None:
     port = server.server_port
@@ -224,6 +361,24 @@ def test_each_malformed_value_gets_400_and_a_line(server: Server, key: str) -> N
         code, text = request(server, "/fly", json.dumps(good | {key: value}))
         assert (code, text.count("\n")) == (400, 1), value
         assert text.isascii()
+
+
+def test_a_training_is_found_by_its_name_alone(root: Path) -> None:
+    with running(Hangar(root)) as server:
+        for name in (
+            "runs/../runs/mine",
+            "../root/runs/mine",
+            "mine",
+            str(root / "runs/mine"),
+            "",
+            1,
+        ):
+            body = json.dumps({"name": name, "since": "0"})
+            code, text = request(server, "/training", body)
+            assert (code, text.count("\n")) == (400, 1), name
+        for body in ('{"name": "runs/mine", "since": "-1"}', '{"name": "runs/mine"}', "[]"):
+            assert request(server, "/training", body)[0] == 400
+        assert request(server, "/trainings", '{"a": "b"}')[0] == 400
 
 
 def test_a_moment_after_the_episode_gets_400(server: Server) -> None:
