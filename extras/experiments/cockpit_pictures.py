@@ -36,9 +36,9 @@ FLAGS = (
 
 
 @contextmanager
-def serving() -> Iterator[str]:
-    """A cockpit at any free port; its address."""
-    server = Server(0, Hangar())
+def serving(root: Path = ROOT) -> Iterator[str]:
+    """A cockpit at any free port; its address. root: where its networks and trainings are."""
+    server = Server(0, Hangar(root))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield f"127.0.0.1:{server.server_port}"
     server.shutdown()
@@ -46,19 +46,24 @@ def serving() -> Iterator[str]:
 
 
 @contextmanager
-def browsing(width: int = 1280, height: int = 720) -> Iterator[webdriver.Chrome]:
-    """A Chromium with a window of so many pixels, and its downloads in `browser.downloads`."""
+def browsing(
+    width: int = 1280, height: int = 720, mobile: bool = False, **prefs: object
+) -> Iterator[webdriver.Chrome]:
+    """A Chromium with a window of so many pixels, and its downloads in `browser.downloads`. mobile:
+    with a finger for a pointer. prefs: of Chromium, by their names."""
     options = webdriver.ChromeOptions()
     options.binary_location = str(CHROMIUM)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        options.add_experimental_option("prefs", {"download.default_directory": folder})
+        prefs |= {"download.default_directory": folder}
+        options.add_experimental_option("prefs", prefs)
         for flag in (*FLAGS, f"--user-data-dir={folder}/profile"):
             options.add_argument(flag)
         browser = webdriver.Chrome(options, Service(str(DRIVER)))
         browser.downloads = Path(folder)
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": mobile}
         browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": mobile})
         yield browser
         browser.quit()
 

@@ -4,6 +4,8 @@ Skipped where Debian's packages chromium and chromium-driver are missing.
 """
 
 import json
+import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,12 +16,13 @@ pytest.importorskip("selenium", reason="extras/requirements.txt is not installed
 
 import torch
 from selenium.webdriver import ActionChains, Chrome, Keys
+from selenium.webdriver.common.actions.action_builder import ActionBuilder
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from deepflight import dqn_pilot, load_weights
 from dqn import QNetwork
-from env import Drone, World, fly, refly
+from env import Drone, Episode, World, fly, random_pilot, refly
 from extras.cockpit.episodes import ROOT
 from extras.experiments.cockpit_pictures import (
     CHROMIUM,
@@ -31,6 +34,7 @@ from extras.experiments.cockpit_pictures import (
     visit,
 )
 from extras.lessons.demonstrations import DemoConfig, read_demos
+from extras.tests.test_cockpit import keep_training, network_episodes
 from render import draw_frame
 
 if not (CHROMIUM.exists() and DRIVER.exists()):
@@ -425,6 +429,115 @@ def test_only_what_was_learned_from_rewards_is_called_q(browser: Chrome, host: s
     assert " Q" not in page
 
 
+def test_nothing_moves_when_an_answer_or_a_long_line_comes(browser: Chrome, host: str) -> None:
+    visit(browser, host, seed=SEED, pilot="network", t=30)
+    places = """["play", "map", "time", "bars", "seen", "why"].map((id) => {
+        const { x, y, width, height } = $(id).getBoundingClientRect();
+        return [id, x, y, width, height];
+    })"""
+    before = value(browser, places)
+    click(browser, "why")
+    until(browser, "reasons && document.querySelectorAll('#answer button').length")
+    assert value(browser, places) == before
+    browser.execute_script("say('a long line '.repeat(60))")
+    assert value(browser, places) == before
+    browser.execute_script("say('')")
+    assert value(browser, places) == before
+
+
+def test_reasons_are_framed_where_the_frame_changes_without_them(
+    browser: Chrome, host: str
+) -> None:
+    visit(browser, host, seed=SEED, pilot="network", t=30)
+    click(browser, "why")
+    until(browser, "reasons")
+    order = "[...reasons.without].sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight))"
+    things = value(browser, f"{order}.map((x) => [x.trunk, x.weight])")[:6]
+    drone = list(refly(value(browser, "episode.record"), World()))[-1]
+    pose, trunks = value(browser, "episode.moments[t].pose"), drone.trunks
+    frames = [draw_frame(pose, np.delete(trunks, i, 0), World()) for i, _ in things]
+    changed = [np.argwhere(draw_frame(pose, trunks, World()) != frame) for frame in frames]
+    expected = [
+        ["for" if weight > 0 else "against", *low[::-1], *(high - low + 1)[::-1]]
+        for (_, weight), pixels in zip(things, changed, strict=True)
+        if len(pixels)
+        for low, high in [(pixels.min(0), pixels.max(0))]
+    ]
+    marks = browser.find_elements(By.CSS_SELECTOR, "#marks rect")
+    names = ("class", "x", "y", "width", "height")
+    found = [[mark.get_attribute(name) for name in names] for mark in marks]
+    assert found == [[kind, *map(str, box)] for kind, *box in expected]
+    assert len(found) > 3
+
+
+def test_each_meaning_has_a_colour_of_its_own(browser: Chrome, host: str) -> None:
+    for scheme in ("light", "dark"):
+        media = [{"name": "prefers-color-scheme", "value": scheme}]
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": media})
+        visit(browser, host, seed=SEED, pilot="network", t=30)
+        click(browser, "why")
+        until(browser, "reasons")
+        value(browser, "whatIf(8)")
+        value(browser, "why()")
+        colour = "getComputedStyle(document.querySelector('{}')).{}"
+        places = {"#path": "stroke", "#ghost-path": "stroke", ".best i": "backgroundColor",
+                  "#map .for": "fill", "#map .against": "fill", "#goal": "fill"}  # fmt: skip
+        found = [value(browser, colour.format(place, key)) for place, key in places.items()]
+        assert len({*found}) == len(found), found
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+def test_a_shared_link_says_what_plays_it(browser: Chrome, host: str) -> None:
+    visit(browser, host, seed=SEED, pilot="network", t=7)
+    assert value(browser, "playing") is False
+    assert text(browser, "hint").startswith("Press Space or Play")
+    press(browser, Keys.SPACE)
+    until(browser, "t > 8")
+
+
+def test_every_choice_says_what_it_is(browser: Chrome, host: str) -> None:
+    visit(browser, host, seed=SEED)
+    for name in ("pilots", "worlds"):
+        for choice in browser.find_elements(By.CSS_SELECTOR, f"#{name} button"):
+            assert choice.get_attribute("title"), choice.text
+
+
+def test_blocked_storage_leaves_the_page_alive(host: str) -> None:
+    block = {"profile.default_content_setting_values.cookies": 2}
+    with browsing(**block) as blocked:
+        assert steered(blocked, host)["outcome"]
+        assert "sessionStorage" in value(blocked, "(() => { try { sessionStorage } catch (e) "
+                                         "{ return e.message } })()")  # fmt: skip
+        assert len(demonstrated(blocked)) == 1
+
+
+def seen_whole(browser: Chrome, *names: str) -> bool:
+    """Whether these stand in the window, above the time line."""
+    script = """const bottom = $("play").getBoundingClientRect().top;
+        return arguments[0].every((id) => {
+            const { top, bottom: low } = $(id).getBoundingClientRect();
+            return top >= 0 && low <= bottom;
+        });"""
+    return browser.execute_script(script, names)
+
+
+def test_on_a_phone_frame_map_and_bars_stand_together_and_fingers_steer(host: str) -> None:
+    with browsing(390, 844, mobile=True) as phone:
+        visit(phone, host, seed=SEED)
+        assert text(phone, "hint").startswith("Press ◀ left or right ▶ to take off.")
+        assert seen_whole(phone, "seen", "map", "bars")
+        at = value(phone, "(({ x, y }) => ({ x: x + 9, y: y + 9 }))"
+                   "($('left').getBoundingClientRect())")  # fmt: skip
+        touch = {"type": "touchStart", "touchPoints": [at]}
+        phone.execute_cdp_cmd("Input.dispatchTouchEvent", touch)
+        until(phone, "end() >= 6")
+        phone.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        until(phone, "!stick.held.left")
+        assert value(phone, "episode.actions").startswith("567888")
+        assert seen_whole(phone, "seen", "map", "bars")
+        assert value(phone, "scrollY") == 0
+
+
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_page_is_no_wider_than_the_window_and_the_time_line_stays_in_it(
     host: str, width: int
@@ -436,3 +549,316 @@ def test_the_page_is_no_wider_than_the_window_and_the_time_line_stays_in_it(
         narrow.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         bottom = "document.querySelector('footer').getBoundingClientRect().bottom"
         assert value(narrow, f"{bottom} <= innerHeight")
+
+
+# -------------------------------------------------- the view "Learning"
+
+STEPS = (5_000, 10_000, 15_000, 20_000)
+ENDS = {"goal": "arrived", "far": "left by the far edge", "side": "left by a side",
+        "back": "left by the back", "crash": "hit a trunk", "time": "ran out of time"}  # fmt: skip
+
+
+def validations(number: int) -> dict[int, list[Episode]]:
+    """The first at random, the others by the shipped network; 48 episodes each."""
+    rng, some = np.random.default_rng(0), network_episodes()
+    flown = [fly(random_pilot(rng), range(10**9, 10**9 + 48), World())]
+    flown += [some[48 * i : 48 * i + 48] for i in range(number - 1)]
+    return dict(zip(STEPS, flown, strict=False))
+
+
+@pytest.fixture(scope="module")
+def flown() -> dict[int, list[Episode]]:
+    return validations(4)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped network, the logs of three committed trainings, and room for runs."""
+    root = tmp_path_factory.mktemp("root")
+    for name in ("dqn", "dqn-1", "dqn-2"):
+        shutil.copytree(ROOT / "results" / name, root / "results" / name)
+    (root / "weights").mkdir()
+    shutil.copy(ROOT / "weights/dqn.pt", root / "weights")
+    return root
+
+
+@pytest.fixture
+def school(root: Path, flown: dict[int, list[Episode]]) -> Iterator[str]:
+    """A cockpit with a training of three validations, `runs/mine`, and its own network."""
+    keep_training(root / "runs/mine", {step: flown[step] for step in STEPS[:3]})
+    shutil.copy(ROOT / "weights/dqn.pt", root / "runs/mine/best.pt")
+    with serving(root) as host:
+        yield host
+    shutil.rmtree(root / "runs")
+
+
+def study(browser: Chrome, host: str, **place: object) -> None:
+    """Open the view at a training and a step, as its address says."""
+    place = {"training": "runs/mine"} | place
+    browser.get("about:blank")
+    browser.get(f"http://{host}/#" + "&".join(f"{key}={x}" for key, x in place.items()))
+    until(browser, "learning() && $('all-ways').children.length")
+
+
+def drawn(browser: Chrome) -> list[list[tuple[float, float]]]:
+    """The points of each way on the map; y is upwards."""
+    script = "[...$('all-ways').children].map((path) => path.getAttribute('d'))"
+    numbers = [[float(x) for x in re.findall(r"-?[\d.]+", d)] for d in value(browser, script)]
+    return [[(x, -y) for x, y in zip(d[::2], d[1::2], strict=True)] for d in numbers]
+
+
+def assert_shows(browser: Chrome, episodes: list[Episode]) -> None:
+    ways = drawn(browser)
+    assert len(ways) == len(episodes) == 48
+    for way, episode in zip(ways, episodes, strict=True):
+        poses = [drone.pose[:2] for drone in refly(episode, World())]
+        assert np.allclose(way, poses, atol=0.0051)
+
+
+def test_the_button_shows_the_last_validation_of_a_training(
+    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+) -> None:
+    visit(browser, school, seed=SEED)
+    click(browser, "learning")
+    until(browser, "$('all-ways').children.length")
+    assert_shows(browser, flown[STEPS[2]])
+    words = "48 validation episodes after 15,000 steps, 3.0 minutes"
+    assert text(browser, "ways-word") == words
+    assert not browser.find_element(By.ID, "map").is_displayed()
+    click(browser, "flying")
+    assert browser.find_element(By.ID, "map").is_displayed()
+    assert value(browser, "episode.record.seed") == SEED
+
+
+def test_keys_range_buttons_and_curves_go_through_the_training(
+    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+) -> None:
+    study(browser, school, step=STEPS[1])
+    assert_shows(browser, flown[STEPS[1]])
+    press(browser, Keys.ARROW_LEFT)
+    assert_shows(browser, flown[STEPS[0]])
+    press(browser, Keys.ARROW_LEFT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)
+    assert value(browser, "[at, $('validation').value]") == [2, "2"]
+    click(browser, "sooner")
+    assert value(browser, "at") == 1
+    browser.find_element(By.ID, "validation").send_keys(Keys.HOME)
+    assert value(browser, "at") == 0
+    curve = browser.find_element(By.CSS_SELECTOR, "#progress svg").rect
+    x, y = curve["x"] + curve["width"] * 15 / 200, curve["y"] + curve["height"] / 2
+    point(browser, x, y, click=True)
+    assert value(browser, "at") == 2, "the committed trainings have 200,000 steps"
+
+
+def point(browser: Chrome, x: float, y: float, click: bool = False) -> None:
+    builder = ActionBuilder(browser)
+    builder.pointer_action.move_to_location(round(x), round(y))
+    if click:
+        builder.pointer_action.click()
+    builder.perform()
+
+
+def test_the_legend_counts_and_has_the_colours_of_the_ways(
+    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+) -> None:
+    okabe_ito = ("230, 159, 0", "86, 180, 233", "0, 158, 115", "0, 114, 178", "213, 94, 0",
+                 "204, 121, 167")  # fmt: skip
+    study(browser, school, step=STEPS[2])
+    outcomes = [episode["outcome"] for episode in flown[STEPS[2]]]
+    counts = {end: outcomes.count(end) for end in ENDS if end in outcomes}
+    legend = browser.find_elements(By.CSS_SELECTOR, "#ends span")
+    assert [x.text.strip() for x in legend] == [f"{ENDS[end]} {n}" for end, n in counts.items()]
+    colour = "(element, key) => getComputedStyle(element)[key]"
+    swatches = f"""[...document.querySelectorAll("#ends span")].map((x) =>
+        [x.dataset.end, ({colour})(x.firstChild, "borderTopColor")])"""
+    strokes = (
+        f"""[...$("all-ways").children].map((x) => [x.dataset.end, ({colour})(x, "stroke")])"""
+    )
+    legend = dict(value(browser, swatches))
+    assert [legend[end] for end, _ in value(browser, strokes)] == [legend[x] for x in outcomes]
+    assert {x[4:-1] for x in legend.values()} <= {*okabe_ito}
+    assert len({*legend.values()}) == len(counts) > 2
+
+
+def test_curves_show_the_log_over_the_band_of_committed_trainings(
+    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+) -> None:
+    study(browser, school, step=STEPS[1])
+    rows = browser.find_elements(By.CSS_SELECTOR, "#progress .curve span")
+    some = flown[STEPS[1]]
+    outcomes = [episode["outcome"] for episode in some]
+    numbers = {
+        "return": np.mean([episode["return"] for episode in some]),
+        "length, steps": np.mean([episode["steps"] for episode in some]),
+        "crossed, %": 100 * (outcomes.count("goal") + outcomes.count("far")) / 48,
+        "hit a trunk, %": 100 * outcomes.count("crash") / 48,
+    }
+    shown = [row.text.replace("\N{MINUS SIGN}", "-").split("\n") for row in rows]
+    assert shown == [[name, f"{x:.1f}"] for name, x in numbers.items()]
+    bands = browser.find_elements(By.CSS_SELECTOR, "#progress .band")
+    points = [len(band.get_attribute("d").split("L")) for band in bands]
+    assert points == 4 * [2 * 40], "least and greatest at each of 40 steps"
+    assert "3 committed trainings that differ in the seed alone" in text(browser, "band")
+
+
+def lone(browser: Chrome) -> tuple[int, float, float]:
+    """An episode whose way ends far from the others', and where that is in the window."""
+    script = """const to = $("ways").getScreenCTM(), ways = now().episodes.map(({ way }) => way);
+        const ends = ways.map((way) => way.at(-1));
+        const i = ends.findIndex(([x, y], i) => ways.every((way, j) =>
+            i === j || way.every((p) => Math.hypot(p[0] - x, p[1] - y) > 2)));
+        const { x, y } = new DOMPoint(ends[i][0], -ends[i][1]).matrixTransform(to);
+        return [i, x, y];"""
+    i, x, y = browser.execute_script(script)
+    return i, x, y
+
+
+def told(episode: Episode) -> str:
+    """What the page says of an episode."""
+    seconds, total = (
+        episode["steps"] / 10,
+        f"{episode['return']:.1f}".replace("-", "\N{MINUS SIGN}"),
+    )
+    return f"forest {episode['seed']}: {ENDS[episode['outcome']]} after {seconds} s, return {total}"
+
+
+def test_pointer_and_keys_name_an_episode(
+    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+) -> None:
+    study(browser, school, step=STEPS[2])
+    i, x, y = lone(browser)
+    point(browser, x, y)
+    assert text(browser, "named") == told(flown[STEPS[2]][i])
+    press(browser, Keys.ARROW_DOWN, Keys.ARROW_DOWN)
+    assert text(browser, "named") == told(flown[STEPS[2]][1])
+    assert value(browser, "document.activeElement.ariaLabel") == told(flown[STEPS[2]][1])
+    press(browser, Keys.ARROW_UP, Keys.ARROW_LEFT)
+    assert text(browser, "named") == told(flown[STEPS[1]][0]), "the same place, a step before"
+
+
+@pytest.mark.parametrize("way", ["click", "Enter"])
+def test_a_chosen_episode_is_flown_as_it_was(
+    browser: Chrome, school: str, flown: dict[int, list[Episode]], way: str
+) -> None:
+    study(browser, school, step=STEPS[1])
+    i, x, y = lone(browser) if way == "click" else (0, 0, 0)
+    if way == "click":
+        point(browser, x, y, click=True)
+    else:
+        press(browser, Keys.ARROW_DOWN, Keys.ENTER)
+    until(browser, "!learning() && episode && ghost && playing && t > 0")
+    assert value(browser, "episode.record") == flown[STEPS[1]][i]
+    assert value(browser, "chosen.weights") == "runs/mine"
+    assert value(browser, "[$('main-name').textContent, ghost.label]") == [
+        "after 10,000 steps", "network"
+    ]  # fmt: skip
+    q = load_weights(ROOT / "weights/dqn.pt")[0]
+    assert [value(browser, "ghost.record")] == fly(
+        dqn_pilot(q), [flown[STEPS[1]][i]["seed"]], World()
+    )
+    press(browser, Keys.SPACE)
+    click(browser, "learning")
+    until(browser, "learning() && now()?.step === 10000 && $('all-ways').children.length")
+    assert value(browser, "training.name") == "runs/mine"
+
+
+def test_the_address_restores_training_and_validation_or_the_recorded_episode(
+    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+) -> None:
+    study(browser, school)
+    press(browser, Keys.ARROW_LEFT)
+    click(browser, "share")
+    until(browser, "$('hint').textContent.includes('this training at this validation')")
+    shared = browser.current_url
+    visit(browser, school, seed=5)
+    browser.get(shared)
+    until(browser, "learning() && now()?.step === 10000")
+    value(browser, "flyEpisode(3)")
+    press(browser, Keys.SPACE)
+    browser.execute_script("stepTo(4)")
+    click(browser, "share")
+    shared = browser.current_url
+    browser.get("about:blank")
+    browser.get(shared)
+    until(browser, "episode && ghost")
+    assert value(browser, "[episode.record, t, $('main-name').textContent]") == [
+        flown[STEPS[1]][3], 4, "after 10,000 steps"
+    ]  # fmt: skip
+    click(browser, "learning")
+    until(browser, "learning() && now()?.step === 10000")
+
+
+def test_in_another_forest_the_network_flies(browser: Chrome, school: str) -> None:
+    study(browser, school)
+    value(browser, "flyEpisode(3)")
+    record = value(browser, "episode.record")
+    value(browser, "actions.again()")
+    assert value(browser, "[chosen.pilot, episode.record]") == ["recorded", record]
+    value(browser, "actions.next()")
+    until(browser, "episode && over()")
+    assert value(browser, "[chosen.pilot, episode.record.seed]") == ["network", record["seed"] + 1]
+
+
+def test_a_validation_appears_while_one_looks(
+    browser: Chrome, school: str, root: Path, flown: dict[int, list[Episode]]
+) -> None:
+    keep_training(root / "runs/mine", {step: flown[step] for step in STEPS[:2]})
+    study(browser, school)
+    assert value(browser, "[at, training.validations.length]") == [1, 2]
+    keep_training(root / "runs/mine", {step: flown[step] for step in STEPS[:3]})
+    WebDriverWait(browser, 3, 0.05).until(lambda _: value(browser, "at === 2"))
+    assert_shows(browser, flown[STEPS[2]])
+    press(browser, Keys.ARROW_LEFT)
+    keep_training(root / "runs/mine", flown)
+    WebDriverWait(browser, 3, 0.05).until(
+        lambda _: value(browser, "training.validations.length === 4")
+    )
+    assert value(browser, "[at, $('count').textContent]") == [1, "2 of 4"]
+    keep_training(root / "runs/mine", {STEPS[0]: flown[STEPS[0]]})
+    until(browser, "training.validations.length === 1")  # it has begun anew
+    assert_shows(browser, flown[STEPS[0]])
+
+
+def test_a_broken_training_is_a_line_and_the_page_goes_on(
+    browser: Chrome, school: str, root: Path, flown: dict[int, list[Episode]]
+) -> None:
+    keep_training(root / "runs/bad", {STEPS[0]: flown[STEPS[0]]})
+    keep_training(root / "runs/none", {STEPS[0]: flown[STEPS[0]]})
+    (root / "runs/none/config.json").unlink()
+    file = root / "runs/bad/validation.jsonl"
+    file.write_text(file.read_text()[:-40])
+    study(browser, school)
+    names = "[...$('training').options].map((option) => option.value)"
+    assert value(browser, names) == ["runs/mine", "runs/bad"]
+    browser.find_element(By.CSS_SELECTOR, "#training option:last-child").click()
+    until(browser, "$('hint').textContent.startsWith('the training runs/bad cannot be read')")
+    assert value(browser, "$('all-ways').children.length") == 0
+    press(browser, Keys.ARROW_LEFT, Keys.ARROW_DOWN, Keys.ENTER)
+    browser.find_element(By.CSS_SELECTOR, "#training option:first-child").click()
+    until(browser, "$('all-ways').children.length === 48")
+    study(browser, school, training="runs/gone")
+    assert text(browser, "hint") == "There is no training runs/gone here."
+    refused = "400 (Bad Request)"  # the browser itself writes these
+    assert all(refused in entry["message"] for entry in browser.get_log("browser"))
+
+
+def test_without_a_training_the_view_says_how_to_begin_one(browser: Chrome, root: Path) -> None:
+    with serving(root) as host:
+        visit(browser, host, seed=SEED)
+        click(browser, "learning")
+        until(browser, "$('hint').textContent.includes('deepflight.py train')")
+        press(browser, Keys.ARROW_LEFT)
+        click(browser, "flying")
+        assert browser.find_element(By.ID, "map").is_displayed()
+
+
+def test_a_finger_on_a_phone_flies_an_episode(school: str, flown: dict[int, list[Episode]]) -> None:
+    with browsing(390, 844, mobile=True) as phone:
+        study(phone, school, step=STEPS[1])
+        assert value(phone, "document.documentElement.scrollWidth") <= 390
+        assert text(phone, "hint").startswith("Tap a way")
+        i, x, y = lone(phone)
+        touch = {"type": "touchStart", "touchPoints": [{"x": x, "y": y}]}
+        phone.execute_cdp_cmd("Input.dispatchTouchEvent", touch)
+        phone.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        until(phone, "!learning() && episode && ghost")
+        assert value(phone, "episode.record") == flown[STEPS[1]][i]
