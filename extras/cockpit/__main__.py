@@ -1,4 +1,4 @@
-"""The cockpit: fly a drone yourself, see what the network thinks, ask it why.
+"""The cockpit: fly a drone, see what the network thinks, ask it why, and watch it learn.
 
     .venv/bin/python -m extras.cockpit              # then open the address that it prints
     .venv/bin/python -m extras.cockpit --port N     # at another port

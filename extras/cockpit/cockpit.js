@@ -4,19 +4,14 @@
 // learning.js is the other view, of a training.
 
 const $ = (id) => document.getElementById(id);
-const [PIXELS, NEAR] = [84, 2.5]; // NEAR: m, from the pointer to what it means
-const ENDS = {
-  goal: "arrived", far: "left by the far edge", side: "left by a side", back: "left by the back",
-  crash: "hit a trunk", time: "ran out of time",
-};
+const [PIXELS, NEAR, SHOWN] = [84, 2.5, 6]; // NEAR: m, from the pointer to what it means; SHOWN: reasons in words
+const ENDS = { goal: "arrived", far: "left by the far edge", side: "left by a side", back: "left by the back", crash: "hit a trunk", time: "ran out of time" };
 const MEANING = {
   you: "You steer.", network: "The network chosen at the right.", random: "Any turn, each as likely.", straight: "Never turns.",
-  laser: "A planner that measures where the trunks are. It knows more than the camera shows.",
-  plain: "The paper's world. Nothing marks the goal.", beacon: "A pole stands at the goal, and can be seen.",
-  disparity: "The frames show how near things are.",
+  laser: "A planner that measures where the trunks are: more than the camera shows.", plain: "The paper's world. Nothing marks the goal.",
+  beacon: "A pole stands at the goal, and can be seen.", disparity: "The frames show how near things are.",
 };
 const RECORDED = "recorded"; // the pilot of a training's validation episode, which is whole from the start
-const CHIPS = 6; // reasons in words
 const touch = matchMedia("(pointer: coarse)").matches;
 const [ARROWS, SPACE, GO] = touch ? ["◀ left or right ▶", "Play", "Play"] : ["← or →", "space", "Space or Play"];
 let options; // what one may choose from, and the numbers of each world
@@ -50,6 +45,12 @@ const signed = (x) => (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).replace(/^0
 const rate = (action) => signed(world().yaw_rate * (action / straight() - 1)); // rad/s
 const inWords = (a) => (a === straight() ? "flies straight on" : `turns ${a > straight() ? "left" : "right"} (${rate(a)} rad/s)`);
 const crossed = ({ record: { outcome } }) => outcome === "goal" || outcome === "far";
+const mean = (values) => values.reduce((sum, x) => sum + x) / values.length;
+const above = (values) => values.map((x) => x - mean(values));
+const svg = (kind) => document.createElementNS("http://www.w3.org/2000/svg", kind);
+const kind = (x) => (x === removed ? "removed" : x.weight > 0 ? "for" : "against");
+const pointed = (event, map) => new DOMPoint(event.clientX, event.clientY).matrixTransform(map.getScreenCTM().inverse());
+const addButton = (parent, textContent, onclick) => parent.appendChild(Object.assign(document.createElement("button"), { textContent, onclick }));
 const set = (node, values) => Object.entries(values).forEach(([key, x]) => node.setAttribute(key, x)) || node;
 const say = (text) => void ($("hint").textContent === text || ($("hint").textContent = text)); // read aloud once
 const writeAddress = () => history.replaceState(null, "", `#${new URLSearchParams(learning() ? place : { ...episode.choice, t, actions: episode.actions })}`);
@@ -109,7 +110,7 @@ async function begin(actions, moment) {
 
 // What one can do now.
 function help() {
-  if (learning()) say(touch ? "Tap a way to fly that episode, or a curve to go there." : "← and → go through the training. Click a way to fly that episode.");
+  if (learning()) say(touch ? "Tap a way to fly that episode, or a curve to go there." : "← and → go through the training, and so does a click on a curve. Click a way to fly that episode.");
   else if (!episode) return;
   else if (playing && recorded()) say(`${chosen.training}, ${who()} of training. Learning goes back to all episodes.`);
   else if (playing) say(steers() ? `Hold ${ARROWS} to turn harder. ${touch ? "Pause" : "Space"} pauses.` : "");
@@ -139,8 +140,6 @@ function turn() {
   [stick.side, stick.tapped] = [side, {}];
   return straight() + side * stick.level;
 }
-
-const release = () => Object.assign(stick, { held: {}, tapped: {} });
 
 function hold(side, down) {
   stick.held[side] = down ? 1 : 0;
@@ -210,9 +209,9 @@ async function wentWrong() {
 
 // -------------------------------------------------- why
 async function why(trunk = null) {
-  const [me, at] = [await settle(), t];
-  const answer = reasons || (await ask("/why", episode.choice, { actions: episode.actions, time: String(at) }));
-  if (me !== asked || at !== t) return;
+  const [me, moment] = [await settle(), t];
+  const answer = reasons || (await ask("/why", episode.choice, { actions: episode.actions, time: String(moment) }));
+  if (me !== asked || moment !== t) return;
   setReasons(answer, removed && removed.trunk === trunk ? null : trunk);
   draw();
   if (trunk !== null && answer.without.every((x) => x.trunk !== trunk)) say("That is in none of the four frames: without it nothing would change.");
@@ -221,28 +220,25 @@ async function why(trunk = null) {
 function setReasons(answer, trunk = null) {
   const things = answer ? [...answer.without].sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight)) : [];
   [reasons, removed] = [answer, things.find((x) => x.trunk === trunk) || null];
-  const [mine, all] = answer ? [answer.before[answer.chosen], mean(answer.before)] : [];
-  $("answer").innerHTML = !answer ? "" : `<p>The network ${inWords(answer.chosen)}: this ${score()} is ${signed(mine - all)} from the mean of the nine. How much of
-    that goes if one trunk is not there? <b class="for">+ is a reason for</b> the turn, <b class="against">− is a reason against</b> it.</p><div></div>`;
-  for (const x of things.slice(0, CHIPS)) {
+  const lead = answer && signed(above(answer.before)[answer.chosen]).slice(1);
+  $("answer").innerHTML = !answer ? "" : `<p>The network ${inWords(answer.chosen)}: this ${score()} is ${lead} above the mean of the nine. The numbers say how much
+    of that is lost without one trunk: <b class="for">+ is a reason for</b> the turn, <b class="against">− a reason against</b> it.</p><div></div>`;
+  for (const x of things.slice(0, SHOWN)) {
     const name = x.trunk < 0 ? "the goal's pole" : whereabouts(episode.trunks[x.trunk]);
     const button = addButton($("answer").lastChild, `${name} ${signed(x.weight)}`, () => attempt(() => why(x.trunk)));
     set(button, { class: x.weight > 0 ? "for" : "against", "aria-pressed": x === removed });
   }
-  $("marks").innerHTML = things.slice(0, CHIPS).map(outline).join("");
+  $("marks").innerHTML = things.slice(0, SHOWN).map(outline).join("");
   drawTrunks();
 }
-
-const kind = (x) => (x === removed ? "removed" : x.weight > 0 ? "for" : "against");
 
 // Where a thing stands in the newest frame: around the pixels that change without it.
 function outline(x) {
   const [before, after] = [episode.moments[t].frame, x.frame].map(atob);
   const changed = [...before].flatMap((pixel, i) => (pixel === after[i] ? [] : [i]));
-  const [columns, rows] = [changed.map((i) => i % PIXELS), changed.map((i) => Math.floor(i / PIXELS))];
-  const [left, top] = [Math.min(...columns), Math.min(...rows)];
-  const size = `width="${Math.max(...columns) - left + 1}" height="${Math.max(...rows) - top + 1}"`;
-  return changed.length ? `<rect class="${kind(x)}" x="${left}" y="${top}" ${size}/>` : "";
+  const span = (of) => [Math.min(...changed.map(of)), Math.max(...changed.map(of)) + 1];
+  const [[left, right], [top, low]] = [span((i) => i % PIXELS), span((i) => Math.floor(i / PIXELS))];
+  return changed.length ? `<rect class="${kind(x)}" x="${left}" y="${top}" width="${right - left}" height="${low - top}"/>` : "";
 }
 
 function whereabouts([x, y]) {
@@ -251,17 +247,15 @@ function whereabouts([x, y]) {
   return `${Math.hypot(x - px, y - py).toFixed(0)} m off, ${Math.abs(left).toFixed(1)} m ${left > 0 ? "left" : "right"}`;
 }
 
-const pointed = (event, map) => new DOMPoint(event.clientX, event.clientY).matrixTransform(map.getScreenCTM().inverse());
-
 function clickMap(event) {
-  const place = pointed(event, $("map"));
-  const things = episode.trunks.map((trunk, i) => [i, trunk]);
-  if (world().beacon) things.push([-1, [world().length, 0]]);
-  const far = things.map(([i, [x, y]]) => [Math.hypot(x - place.x, y + place.y), i]).sort((a, b) => a[0] - b[0]);
+  const { x: px, y: py } = pointed(event, $("map"));
+  const things = [...episode.trunks.entries(), ...(world().beacon ? [[-1, [world().length, 0]]] : [])];
+  const far = things.map(([i, [x, y]]) => [Math.hypot(x - px, y + py), i]).sort((a, b) => a[0] - b[0]);
   if (far[0][0] < NEAR) attempt(() => why(far[0][1]));
 }
 
 // -------------------------------------------------- play
+const release = () => Object.assign(stick, { held: {}, tapped: {} });
 const play = () => playing || setPlaying(true);
 const pause = () => setPlaying(false);
 
@@ -301,9 +295,9 @@ function stepTo(moment) {
 function show(moment) {
   if (moment !== t && reasons) setReasons(null);
   t = moment;
-  const { choice, record } = episode;
-  const name = `${choice.world} ${record.seed} ${record.actions}`;
-  if (choice.pilot === "you" && over()) kept.done = JSON.stringify([...done.set(name, { world: choice.world, ...record })]);
+  const { choice: { world, pilot }, record } = episode;
+  const name = `${world} ${record.seed} ${record.actions}`;
+  if (pilot === "you" && over()) kept.done = JSON.stringify([...done.set(name, { world, ...record })]);
   draw();
 }
 
@@ -319,7 +313,7 @@ function drawForest() {
   const { length, num_actions, beacon } = world();
   drawGround($("map"), world());
   set($("pole"), { cx: length, r: beacon ? 0.7 : 0 });
-  const circle = ([cx, y]) => set(document.createElementNS("http://www.w3.org/2000/svg", "circle"), { cx, cy: -y });
+  const circle = ([cx, y]) => set(svg("circle"), { cx, cy: -y });
   $("trunks").replaceChildren(...episode.trunks.map(circle));
   for (let a = num_actions - 1; a >= 0 && $("bars").children.length < num_actions; a--) {
     const bar = addButton($("bars"), "", () => attempt(() => whatIf(a)));
@@ -331,8 +325,7 @@ function draw() {
   paint($("seen"), removed ? removed.frame : episode.moments[t].frame);
   [...$("stack").children].forEach((canvas, i) => paint(canvas, episode.moments[Math.max(t - 3 + i, 0)].frame));
   [drawMap, drawBars, drawCurves, drawTable].forEach((part) => part());
-  $("time").max = end();
-  $("time").value = t;
+  [$("time").max, $("time").value] = [end(), t];
   set($("time"), { "aria-valuetext": clock(t) });
   $("clock").textContent = `${clock(t)} of ${clock(end())}`;
   const banner = t === end() && over() && `${ended(episode)}, return ${number(episode.record.return)}`;
@@ -359,8 +352,7 @@ function drawMap() {
   set($("ghost-path"), { points: path(known) });
   const at = ghost && ghost.moments[Math.min(t, ghost.moments.length - 1)].pose;
   set($("ghost"), { transform: at ? place(at) : "translate(-99 0)" });
-  [$("main-name").textContent, $("ghost-name").textContent] = [who(), ghost ? ghost.label : ""];
-  $("ghost-mark").hidden = !ghost;
+  [$("main-name").textContent, $("ghost-name").textContent, $("ghost-mark").hidden] = [who(), ghost ? ghost.label : "", !ghost];
 }
 
 function drawTrunks() {
@@ -373,9 +365,6 @@ function drawTrunks() {
   colour($("goal"), found.get(-1), world().goal_radius);
   [...$("trunks").children].forEach((circle, i) => colour(circle, found.get(i), 1.2 * world().trunk_radius));
 }
-
-const mean = (values) => values.reduce((sum, x) => sum + x) / values.length;
-const above = (values) => values.map((x) => x - mean(values));
 
 function drawBars() {
   const [q, other] = [episode.moments[t].q, removed && removed.q];
@@ -400,7 +389,7 @@ function curve(name, value, line, cursor, band = []) {
   const ys = [...line, ...band].flatMap(([, ...y]) => y);
   const [low, high] = [Math.min(0, ...ys), Math.max(1, ...ys)];
   const place = ([x, y]) => `${(100 * x).toFixed(2)} ${(30 - (30 * (y - low)) / (high - low)).toFixed(2)}`;
-  const path = (kind, points) => (points.length ? `<path class="${kind}" d="M${points.map(place).join("L")}"/>` : "");
+  const path = (kind, points) => (points.length ? `<path class="${kind}" fill="none" stroke-width="1.5" vector-effect="non-scaling-stroke" d="M${points.map(place).join("L")}"/>` : "");
   const around = [...band, ...band.map(([x, , greatest]) => [x, greatest]).reverse()];
   const paths = [path("band", around), path("line", line), path("cursor", [[cursor, low], [cursor, high]])].join("");
   return `<div class="curve"><span>${name} <b>${number(value)}</b></span><svg viewBox="0 0 100 30" preserveAspectRatio="none"
@@ -424,13 +413,6 @@ function drawTable() {
 }
 
 // -------------------------------------------------- choices, address, file
-function addButton(parent, text, action) {
-  const button = parent.appendChild(document.createElement("button"));
-  button.textContent = text;
-  button.addEventListener("click", action);
-  return button;
-}
-
 async function choose(change, actions = "", moment = null) {
   const after = (chosen = { ...chosen, ...change });
   if (recorded() && !actions) chosen.pilot = "network"; // in another forest
@@ -445,17 +427,14 @@ async function choose(change, actions = "", moment = null) {
 function drawChoices() {
   const names = { pilot: options.pilots, world: Object.keys(options.worlds) };
   for (const [key, all] of Object.entries(names)) {
-    const row = $(`${key}s`);
-    const add = (name) => addButton(row, name, () => choose(key === "world" ? { world: name, weights: "" } : { pilot: name }));
+    const row = $(`${key}s`), add = (name) => addButton(row, name, () => choose(key === "world" ? { world: name, weights: "" } : { pilot: name }));
     if (!row.children.length) all.forEach((name) => set(add(name), { title: MEANING[name] || "" }));
     for (const button of row.children) set(button, { "aria-pressed": button.textContent === chosen[key] });
     if (key === "world") all.forEach((name, i) => (row.children[i].disabled = !Object.keys(options.worlds[name].weights).length));
   }
   $("weights").replaceChildren(...Object.keys(world().weights).map((name) => new Option(name, name, false, name === chosen.weights)));
   $("seed").value = chosen.seed;
-  $("stick").hidden = !byHand();
-  [$("q").hidden, $("scores").hidden] = [!isQ(), isQ()];
-  document.querySelectorAll(".score").forEach((node) => (node.textContent = score()));
+  [$("stick").hidden, $("q").hidden, $("scores").hidden] = [!byHand(), !isQ(), isQ()];
 }
 
 async function restore() {
@@ -465,10 +444,8 @@ async function restore() {
   if (told.world in options.worlds && Object.keys(options.worlds[told.world].weights).length) first.world = told.world;
   if (told.training) place = { training: told.training, step: told.step };
   if (told.pilot === RECORDED && told.training && told.step > 0) Object.assign(first, place, { pilot: RECORDED });
-  if (told.training && !told.seed) {
-    if (!episode) chosen = first;
-    return attempt(openLearning);
-  }
+  if (!episode) chosen = first;
+  if (told.training && !told.seed) return attempt(openLearning);
   setView(false);
   if (await choose(first, told.actions, Math.trunc(Math.abs(Number(told.t))) || 0) || episode) return;
   const wrong = $("hint").textContent;
@@ -479,36 +456,31 @@ async function share() {
   pause();
   writeAddress();
   const copied = await navigator.clipboard.writeText(location.href).then(() => " It is copied.", () => "");
-  say(`The address of this page holds ${learning() ? "this training at this validation" : "this episode at this moment"}.${copied} It opens where a cockpit runs at ${location.host}.`);
+  const what = learning() ? "this training at this validation" : "this episode at this moment";
+  say(`The address of this page holds ${what}.${copied} It opens where a cockpit runs at ${location.host}.`);
 }
 
 function save() {
   pause();
   const episodes = [...done.values()].filter((f) => f.world === chosen.world && f.seed < options.train_end);
-  const out = done.size - episodes.length;
-  const left = out ? ` Left out: ${out}, of another world, or of a forest from 1,000,000,000 up (those are for validation and tests).` : "";
+  const left = done.size === episodes.length ? "" : ` Left out: ${done.size - episodes.length}, of another world, or of a forest from 1,000,000,000 up (those are for validation and tests).`;
   if (!episodes.length) return say(`There is no episode to save. Fly by hand to an end, in a forest below 1,000,000,000.${left}`);
-  const { beacon, camera } = world();
-  const pilots = { you: { episodes: episodes.map(({ world, ...record }) => record) } };
+  const [{ beacon, camera }, pilots] = [world(), { you: { episodes: episodes.map(({ world, ...record }) => record) } }];
   const file = new Blob([JSON.stringify({ beacon, camera, pilots })], { type: "application/json" });
   Object.assign(document.createElement("a"), { href: URL.createObjectURL(file), download: "episodes.json" }).click();
   const flags = (beacon ? " --beacon" : "") + (camera === "grey" ? "" : ` --camera ${camera}`);
-  say(`Episodes in the file episodes.json: ${episodes.length}.${left}
-    To learn from them: .venv/bin/python -m extras.lessons.demonstrations train --demos FILE --demo-pilot you${flags}`);
+  say(`Episodes in the file episodes.json: ${episodes.length}.${left} To learn from them: .venv/bin/python -m extras.lessons.demonstrations train --demos FILE --demo-pilot you${flags}`);
 }
 
 // -------------------------------------------------- keys and buttons
 const actions = {
-  play: () => (playing ? pause() : play()),
-  back: () => stepTo(t - 1),
-  step: () => stepTo(t + 1),
+  play: () => (playing ? pause() : play()), back: () => stepTo(t - 1), step: () => stepTo(t + 1),
+  sooner: () => goTo(at - 1), later: () => goTo(at + 1), learning: () => attempt(openLearning), flying: openFlying,
   next: () => choose({ seed: String(BigInt(chosen.seed) + 1n) }),
   again: () => choose({}, recorded() ? episode.actions : ""),
   random: () => choose({ seed: String(Math.floor(Math.random() * options.train_end)) }),
-  why: () => attempt(() => why()),
   take: () => choose({ pilot: "you" }, episode.actions.slice(0, over() ? Math.min(t, end() - 1) : t), t),
-  wrong: () => attempt(wentWrong),
-  learning: () => attempt(openLearning), flying: openFlying, sooner: () => goTo(at - 1), later: () => goTo(at + 1),
+  why: () => attempt(() => why()), wrong: () => attempt(wentWrong),
   clear, share, save,
 };
 const KEYS = { " ": "play", ",": "back", ".": "step", n: "next", r: "again", w: "why", Escape: "clear" };
@@ -519,13 +491,12 @@ function key(event) {
   const own = event.target.matches("input, select") || (name === " " && event.target.matches("button"));
   const [side, action] = [SIDES[name], actions[KEYS[name]]];
   if (side && event.type === "keyup") hold(side, false); // whatever has the focus
-  if (own || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (own || event.type === "keyup" || event.ctrlKey || event.metaKey || event.altKey) return;
   if (learning()) return learningKey(event);
   if (!episode || !(side || action)) return;
   event.preventDefault();
-  if (event.type === "keyup") return;
-  if (side && !event.repeat) hold(side, true);
   if (action) action();
+  else if (!event.repeat) hold(side, true);
 }
 
 function listen() {
@@ -536,13 +507,11 @@ function listen() {
   document.addEventListener("visibilitychange", () => document.hidden && (release(), pause()));
   // What was clicked by a mouse would keep the focus, and take the keys that steer.
   document.addEventListener("click", (event) => event.detail && event.target.matches("button, [type=range]") && event.target.blur());
-  for (const side of ["left", "right"]) {
-    on(side, "pointerdown", () => hold(side, true));
-    for (const name of ["pointerup", "pointerleave", "pointercancel"]) on(side, name, () => hold(side, false));
-  }
+  const hands = Object.entries({ pointerdown: true, pointerup: false, pointerleave: false, pointercancel: false });
+  for (const side of ["left", "right"]) for (const [name, down] of hands) on(side, name, () => hold(side, down));
   for (const [name, action] of Object.entries(actions)) if ($(name)) on(name, "click", () => (episode || learning()) && action());
-  on("map", "click", clickMap);
   listenLearning(on);
+  on("map", "click", clickMap);
   on("time", "input", () => stepTo(Number($("time").value)));
   on("seed", "change", () => choose({ seed: $("seed").value.trim() }));
   on("weights", "change", () => choose({ weights: $("weights").value }, recorded() ? episode.actions : ""));

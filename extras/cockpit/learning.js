@@ -12,30 +12,24 @@ const learning = () => document.body.classList.contains("learning");
 const now = () => training?.validations[at];
 const lastStep = () => Math.max(training.validations.at(-1).step, training.band.at(-1)?.step[0] || 0);
 
-function setView(toLearning) {
-  document.body.classList.toggle("learning", toLearning);
-  pause();
-}
+const setView = (toLearning) => (document.body.classList.toggle("learning", toLearning), pause());
 
-function openFlying() {
-  setView(false);
-  return episode ? draw() : choose({});
-}
+const openFlying = () => (setView(false), episode ? draw() : choose({}));
 
-// Show the training and the step of `place`, or the latest run at its last validation.
-async function openLearning() {
-  const { training: name, step } = place;
+// Show a training at the step of `place`, or else the latest run, and its last validation.
+async function openLearning(name = place.training) {
+  const { step } = place;
   setView(true);
   const found = await post("/trainings", {});
   if (!found.length) throw new Error("There is no training with validation episodes here. This begins one: python deepflight.py train");
   const known = found.find((x) => x.name === name);
-  training = { ...(known || found[0]), validations: [] };
-  const select = found.map((x) => new Option(x.name, x.name, false, x.name === training.name));
-  $("training").replaceChildren(...select);
+  const mine = (training = { ...(known || found[0]), validations: [] });
+  $("training").replaceChildren(...found.map((x) => new Option(x.name, x.name, false, x.name === mine.name)));
   for (const id of ["ways-word", "all-ways", "ends", "progress", "band", "count", "named"]) $(id).replaceChildren();
-  drawGround($("ways"), options.worlds[training.world]);
+  drawGround($("ways"), options.worlds[mine.world]);
   await learnMore();
-  const there = training.validations.findIndex((x) => x.step === Number(step));
+  if (mine !== training) return;
+  const there = mine.validations.findIndex((x) => x.step === Number(step));
   goTo(there < 0 ? Infinity : there);
   if (name && !known) say(`There is no training ${name} here.`);
 }
@@ -58,19 +52,19 @@ async function poll() {
 }
 
 function goTo(validation) {
+  if (!training?.validations.length) return say("There is no validation yet.");
   at = Math.max(Math.min(validation, training.validations.length - 1), 0);
-  if (!now()) return say(`${training.name} has no validation yet.`);
   place = { training: training.name, step: now().step };
   drawProgress();
   drawWays();
 }
 
 async function flyEpisode(i) {
-  const [e, { world, weights }] = [now()?.episodes[i], training];
-  if (!e) return;
+  if (!now()?.episodes[i]) return;
+  const [{ seed, actions }, { world, weights }, from] = [now().episodes[i], training, place];
   options = await post("/options", {}); // the weights of a running training may be younger than the page
   setView(false);
-  await choose({ ...place, pilot: RECORDED, world, weights, seed: String(e.seed) }, e.actions);
+  await choose({ ...from, pilot: RECORDED, world, weights, seed: String(seed) }, actions);
 }
 
 // -------------------------------------------------- drawing
@@ -85,27 +79,26 @@ function wayOf({ actions }) {
   return [[0, 0], ...Array.from(actions, step)];
 }
 
-const outlineOf = ({ way }) => `M${way.map(([x, y]) => `${x.toFixed(2)} ${(-y).toFixed(2)}`).join("L")}`;
+const cm = (x) => Math.round(100 * x) / 100; // toFixed is slow
+// Each third point is enough for the eye, and halves the time to draw them all.
+const outlineOf = (e) => (e.outline ||= `M${e.way.filter((_, i) => i % 3 === 0 || i === e.way.length - 1).map(([x, y]) => `${cm(x)} ${cm(-y)}`).join("L")}`);
 const described = (e) => `forest ${e.seed}: ${ENDS[e.outcome]} after ${clock(e.steps)}, return ${number(e.return)}`;
 
 function drawWays() {
-  const [{ episodes, step, minutes }, ways] = [now(), $("all-ways")];
-  const when = `after ${thousands(step)} steps`;
+  const [{ episodes, minutes }, ways, when] = [now(), $("all-ways"), `after ${thousands(now().step)} steps`];
   $("ways-word").textContent = `${episodes.length} validation episodes ${when}, ${number(minutes)} minutes`;
-  const missing = Math.max(episodes.length - ways.children.length, 0);
-  ways.append(...Array.from({ length: missing }, () => document.createElementNS("http://www.w3.org/2000/svg", "path")));
-  [...ways.children].slice(episodes.length).forEach((path) => path.remove());
+  if (ways.children.length !== episodes.length) ways.replaceChildren(...episodes.map(() => svg("path")));
   episodes.forEach((e, i) => {
     e.way ||= wayOf(e);
     // The Tab key finds one of them, and ↑ and ↓ lead to the others.
     set(ways.children[i], { d: outlineOf(e), "data-end": e.outcome, role: "button", tabindex: i ? -1 : 0, "aria-label": described(e) });
   });
   const counts = Object.keys(ENDS).map((end) => [end, episodes.filter((e) => e.outcome === end).length]);
-  $("ends").innerHTML = counts.map(([end, n]) => (n ? `<span data-end="${end}"><i class="swatch"></i> ${ENDS[end]} ${n}</span>` : "")).join("");
+  $("ends").innerHTML = counts.map(([end, n]) => (n ? `<span data-end="${end}"><b class="swatch" aria-hidden="true">■</b> ${ENDS[end]} ${n}</span>` : "")).join("");
   [$("validation").max, $("validation").value] = [training.validations.length - 1, at];
   set($("validation"), { "aria-valuetext": when });
   $("count").textContent = `${at + 1} of ${training.validations.length}`;
-  name(named);
+  nameWay(named);
 }
 
 function drawProgress() {
@@ -116,13 +109,13 @@ function drawProgress() {
     return curve(title, factor * now()[key], line, now().step / lastStep(), around);
   };
   $("progress").innerHTML = Object.entries(CURVES).map(one).join("");
-  const outside = `By chance alone, ${Math.round(200 / (others + 1))} % of another seed's validations lie outside it.`;
-  const words = `Band: from the least to the greatest of ${others} committed trainings that differ in the seed alone. ${outside}`;
-  $("band").textContent = `From step 0 to ${thousands(lastStep())}. ${others ? words : "No other committed training has these settings."}`;
+  $("band").textContent = `From step 0 to ${thousands(lastStep())}. ` + (!others ? "No other committed training has these settings." :
+    `Band: from least to greatest of the committed trainings that differ in the seed alone (${others}).
+    By chance, ${Math.round(200 / (others + 1))} % of another seed's validations lie outside it.`);
 }
 
 // Tell which episode it is; -1 is none.
-function name(i) {
+function nameWay(i) {
   const e = now()?.episodes[(named = i)];
   $("named").textContent = e ? described(e) : "Point at a way, and it says which episode that is.";
   set($("one-way"), { d: e ? outlineOf(e) : "M0 0", "data-end": e ? e.outcome : "" });
@@ -147,21 +140,18 @@ function learningKey(event) {
   const i = ways.indexOf(event.target);
   const keys = { ArrowLeft: actions.sooner, ArrowRight: actions.later, ArrowDown: () => ways.at(i + 1)?.focus(), ArrowUp: () => ways.at(i - 1)?.focus() };
   if (i >= 0) keys.Enter = keys[" "] = () => attempt(() => flyEpisode(i));
-  if (event.type === "keyup" || !training || !keys[event.key]) return;
+  if (!keys[event.key]) return;
   event.preventDefault();
   keys[event.key]();
 }
 
 function listenLearning(on) {
-  on("ways", "pointermove", (event) => name(pointedAt(event)));
-  on("ways", "pointerleave", () => name(-1));
-  on("all-ways", "focusin", (event) => name([...$("all-ways").children].indexOf(event.target)));
+  on("ways", "pointermove", (event) => nameWay(pointedAt(event)));
+  on("ways", "pointerleave", () => nameWay(-1));
+  on("all-ways", "focusin", (event) => nameWay([...$("all-ways").children].indexOf(event.target)));
   on("ways", "click", (event) => attempt(() => flyEpisode(pointedAt(event))));
   on("progress", "click", clickCurve);
   on("validation", "input", () => goTo(Number($("validation").value)));
-  on("training", "change", () => {
-    place.training = $("training").value;
-    attempt(openLearning);
-  });
+  on("training", "change", () => attempt(() => openLearning($("training").value)));
   setInterval(poll, 2000);
 }
