@@ -1,6 +1,5 @@
 "use strict";
-// The view "Learning": a training, validation by validation. It shows the ways of all episodes of
-// one, which follow from their actions alone, and four curves over the whole training.
+// The view "Learning": a training, validation by validation. The ways of its episodes follow from their actions alone.
 
 const CURVES = { return: ["return", 1], steps: ["length, steps", 1], crossed: ["crossed, %", 100], crash: ["hit a trunk, %", 100] };
 let training = null; // on show: name, world, weights, validations, and the band of how many others
