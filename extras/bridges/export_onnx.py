@@ -3,6 +3,11 @@
     extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.bridges.export_onnx      # weights/dqn.pt -> runs/dqn.onnx
     extras/.venv/bin/python -m extras.bridges.export_onnx --camera disparity
+    extras/.venv/bin/python -m extras.bridges.export_onnx --weights runs/a/best.pt
+
+The last one writes runs/a/best.onnx; `--out` names another file. Of the files that are there it
+replaces only an export of its own, which it knows by the metadata: `pilot`, `run`, `camera`,
+`beacon`, and the whole `world` as JSON.
 
 Input `observation` (B, 4, 84, 84) uint8, output `q` (B, 9) float32, any B; the action is the
 argmax. The script then flies validation forests, half of the drones at random, and holds the
@@ -28,19 +33,22 @@ What a stereo camera must deliver to the disparity pilot, ten times a second:
 import argparse
 import json
 import logging
+import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from itertools import count
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime
 import torch
 from numpy import ndarray
 
-from deepflight import VALIDATION, load_weights
-from dqn import QNetwork
+from deepflight import VALIDATION, load_weights, save
+from dqn import InputError, QNetwork
 from env import VecForest, World
 from render import CAMERAS
 
@@ -48,7 +56,26 @@ ROOT, SIZE = Path(__file__).parents[2], 1000
 WARMUP, CALLS = 50, 1000  # decisions before and in a timing
 
 
-def export(q: QNetwork, path: Path) -> None:
+def label(weights: Path, world: World, pilot: str) -> dict[str, str]:
+    """What an export says of itself: its pilot, its run, and the world that it was trained for."""
+    where = {"pilot": pilot, "run": "/".join(weights.resolve().parts[-2:])}
+    seen = {"camera": world.camera, "beacon": json.dumps(world.beacon)}
+    return where | seen | {"world": json.dumps(asdict(world))}
+
+
+def check_free(path: Path) -> None:
+    """InputError if an export would replace a file that is none."""
+    try:
+        keys = {each.key for each in onnx.load(path).metadata_props}
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except Exception:  # a foreign file can fail in any way
+        keys = set()
+    if not keys >= {"pilot", "run", "world"}:
+        raise InputError(f"{path} is there and no export of this script: give another --out")
+
+
+def export(q: QNetwork, path: Path, metadata: dict[str, str]) -> None:
     """Write the network as one ONNX file, its weights inside."""
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, we do not
     with warnings.catch_warnings():
@@ -64,8 +91,9 @@ def export(q: QNetwork, path: Path) -> None:
             dynamic_shapes=({0: torch.export.Dim("batch")},),
         )
     program.model.ir_version = 9  # the newest that onnxruntime 1.17 reads, on a Jetson
+    program.model.metadata_props.update(metadata)
     path.parent.mkdir(parents=True, exist_ok=True)
-    program.save(path, external_data=False)
+    save(path, program.model_proto.SerializeToString())
 
 
 def session(path: Path) -> onnxruntime.InferenceSession:
@@ -107,27 +135,36 @@ def latency(decide: Callable[[ndarray], object], s: ndarray) -> dict[str, float]
     return {"p50": float(p50), "p99": float(p99)}
 
 
-def main() -> None:
-    """Export, compare, time."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def main(argv: Sequence[str] | None = None) -> int:
+    """Export, compare, time. Trouble comes with one line and exit code 2."""
+    parser = argparse.ArgumentParser(prog="export_onnx", usage=argparse.SUPPRESS)
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--weights", type=Path, help="default: weights/dqn.pt")
     which.add_argument("--beacon", action="store_true", help="the shipped ones that see a beacon")
     which.add_argument("--camera", choices=CAMERAS, default="grey", help="what a pixel says")
-    args = parser.parse_args()
+    parser.add_argument("--out", type=Path, help="default: beside --weights, for others runs/")
+    args = parser.parse_args(argv)
     torch.set_num_threads(1)
     shipped = "dqn-beacon" if args.beacon else "dqn"
     shipped = "imitation-disparity" if args.camera == "disparity" else shipped
     weights = args.weights or ROOT / f"weights/{shipped}.pt"
-    q, world, _ = load_weights(weights)
-    path = Path("runs") / f"{weights.stem}.onnx"
-    export(q, path)
+    beside = weights.with_suffix(".onnx") if args.weights else Path("runs", f"{shipped}.onnx")
+    path = args.out or beside
+    try:
+        q, world, pilot = load_weights(weights)
+        check_free(path)
+        export(q, path, label(weights, world, pilot))
+    except (InputError, OSError) as error:
+        print(f"export_onnx: {error}", file=sys.stderr)
+        return 2
+    print(f"wrote {path}, {path.stat().st_size / 1e6:.1f} MB", flush=True)
     run, s = session(path), observations(q, world, SIZE)
-    report = parity(q, run, s)
+    report: dict[str, object] = {**parity(q, run, s)}
     report["onnxruntime, ms"] = latency(lambda one: run.run(None, {"observation": one}), s)
     report["torch, ms"] = latency(lambda one: q.values(one, ()), s)
-    print(f"wrote {path}, {path.stat().st_size / 1e6:.1f} MB\n{json.dumps(report, indent=1)}")
+    print(json.dumps(report, indent=1))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
