@@ -7,11 +7,12 @@
     env = gymnasium.make("DeepFlight/Forest-v0", render_mode="rgb_array", beacon=True)
     observation, info = env.reset(seed=3_000_000_000)
     envs = gymnasium.make_vec("DeepFlight/Forest-v0", num_envs=8)
+    gymnasium.utils.play.play(env)           # if you import it, and have pygame: keys a, d and w
 
 Observation: Box(0, 255, (4, 84, 84), uint8), oldest frame first. Action: Discrete(9), 0 turns
-right, 8 left. Every field of env.World is a keyword argument. The world itself truncates after
-`max_steps`, and Gymnasium's time limit is 1,000 steps as well: for longer episodes give
-`gymnasium.make` both `max_steps=2000` and `max_episode_steps=2000`.
+right, 8 left. Every field of env.World is a keyword argument. The smaller of `max_steps`, the
+world's, and `max_episode_steps`, Gymnasium's, truncates. Both are 1,000: for longer episodes give
+`make` or `make_vec` both.
 
 A seed is a forest. `reset(seed=k)` plants forest k, the same that `deepflight.py eval` flies as k.
 A reset without a seed draws one below 10^9, the range of training, from the environment's own
@@ -23,8 +24,14 @@ whose seeds are below 10^9, even if both get the same seeds, as from Stable-Base
 
     EvalCallback(Monitor(gymnasium.make("DeepFlight/Forest-v0", forests="validation")))
 
-`make_vec` gives drones side by side. `reset(seed=k)` plants forests k, k + 1, and so on. The step
-after an episode's end begins the next one in that environment, ignores its action, and pays 0.
+`make_vec` gives drones side by side. `reset(seed=k)` plants forests k, k + 1, and so on; with
+`options={"reset_mask": mask}` only those of the mask (E,), as in Gymnasium's own vectors. The
+keyword `autoreset_mode` says what follows the end of an episode:
+
+    "NextStep"  the next step begins the next one, ignores its action, and pays 0; the default
+    "SameStep"  the next one begins at once; infos keep the end as `final_obs` and `final_info`
+                (RecordEpisodeStatistics of Gymnasium 1.2 then counts a step too few)
+    "Disabled"  nothing: reset that drone, by a mask, before the next step
 """
 
 from collections.abc import Sequence
@@ -51,12 +58,10 @@ AnyEnv = gymnasium.Env | VectorEnv
 
 def dress(env: AnyEnv, world: World, num_envs: int, render_mode: str | None, forests: str) -> None:
     """Give an environment its drones, its range of forests, and the spaces of one drone."""
-    for name, value, allowed in (
-        ("render_mode", render_mode, (None, "rgb_array")),
-        ("forests", forests, tuple(RANGES)),
-    ):
-        if value not in allowed:
-            raise ValueError(f"{name} is {value!r}, allowed: {allowed}")
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f"render_mode is {render_mode!r}, allowed: None, 'rgb_array'")
+    if forests not in RANGES:
+        raise ValueError(f"forests is {forests!r}, allowed: {tuple(RANGES)}")
     if world.speed * world.dt >= world.trunk_radius + world.d_crash:
         raise ValueError(f"speed {world.speed} m/s: a step could jump through a trunk unseen")
     env.envs = VecForest(world, num_envs, ())  # it looks; we reset and step its drones
@@ -82,9 +87,11 @@ def look(envs: VecForest) -> ndarray:
 
 
 def info(drone: Drone) -> dict[str, Any]:
-    """Distances in m, the pose (x, y, heading), how the episode ended or "", and the forest."""
+    """Distances in m, the pose (x, y, heading), how the episode ended or "", and the forest;
+    `is_success` if the drone has crossed, of which Stable-Baselines3 prints the share."""
     keys = "d_obs", "d_goal", "pose", "forward", "progress", "outcome"
-    return {key: getattr(drone, key) for key in keys} | {"forest": drone.seed}
+    ended = {"forest": drone.seed, "is_success": drone.outcome in ("goal", "far")}
+    return {key: getattr(drone, key) for key in keys} | ended
 
 
 def picture(drone: Drone) -> ndarray:
@@ -130,71 +137,106 @@ class Forest(gymnasium.Env):
         """The picture, if there is a render mode."""
         return picture(self.drone) if self.render_mode else None
 
+    def get_keys_to_action(self) -> dict[str, int]:
+        """For gymnasium.utils.play: a turns left, d right, with w less; no key is straight on."""
+        actions, straight = self.envs.num_actions, self.envs.num_actions // 2
+        turns = {"a": actions - 1, "aw": (straight + actions) // 2, "dw": straight // 2, "d": 0}
+        return turns | dict.fromkeys(("", "w", "ad", "adw"), straight)
+
 
 class Forests(VectorEnv):
     """E drones side by side.
 
-    The arguments are those of Forest. max_episode_steps is what gymnasium.make_vec passes on; it
-    stands for max_steps, unless that is given.
+    The arguments are those of Forest, and two of Gymnasium's: max_episode_steps, the time limit
+    that make_vec passes on (-1: none), and autoreset_mode, an AutoresetMode or its value.
     """
 
     metadata: ClassVar[dict[str, Any]] = RENDER | {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(
         self, num_envs: int = 1, render_mode: str | None = None, *, forests: str = "training",
-        max_episode_steps: int = World.max_steps, **world: Any,
+        max_episode_steps: int = -1, autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **world: Any,
     ) -> None:  # fmt: skip
-        self.num_envs, world = num_envs, {"max_steps": max_episode_steps} | world
+        limit, theirs = world.get("max_steps", World.max_steps), max_episode_steps
+        world["max_steps"] = limit if theirs == -1 else min(limit, theirs)
         dress(self, World(**world), num_envs, render_mode, forests)
+        self.num_envs, self.mode = num_envs, AutoresetMode(autoreset_mode)
+        self.metadata = self.metadata | {"autoreset_mode": self.mode}
         self.single_observation_space = self.observation_space
         self.single_action_space = self.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict | None = None
     ) -> tuple[ndarray, dict[str, Any]]:
-        """Plant the forests of `seed`, `seed` + 1, ..., or those of a list; `options` is unused.
+        """Plant the forests of `seed`, `seed` + 1, ..., or those of a list.
 
-        Where there is no seed, `np_random` draws one. The first seed given seeds `np_random`.
+        Where there is no seed, `np_random` draws one. The first seed used seeds `np_random`. Only
+        the drones of `options["reset_mask"]`, if it is given, begin anew and are in infos.
         """
+        chosen = self._chosen((options or {}).get("reset_mask"))
         if seed is None or isinstance(seed, int):
             seed = [None if seed is None else seed + i for i in range(self.num_envs)]
-        super().reset(seed=next((k for k in seed if k is not None), None))
-        for drone, k in zip(self.envs.drones, seed, strict=True):
-            begin(self, drone, k)
-        return look(self.envs), self._infos()
+        pairs = [*zip(self.envs.drones, seed, strict=True)]
+        super().reset(seed=next((pairs[i][1] for i in chosen if pairs[i][1] is not None), None))
+        for i in chosen:
+            begin(self, *pairs[i])
+        return look(self.envs), self._infos(chosen, {})
+
+    def _chosen(self, mask: ndarray | None) -> Sequence[int]:
+        """Which drones a mask (E,) means, by number. ValueError if it is none, or names none."""
+        if mask is None:
+            return range(self.num_envs)
+        mask, never = np.asarray(mask), [drone.outcome == "not reset" for drone in self.envs.drones]
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise ValueError(f"reset_mask is {mask}, allowed: {self.num_envs} bools, not all False")
+        if np.any(never & ~mask):
+            raise ValueError(f"reset_mask is {mask}: it leaves out a drone that was never reset")
+        return np.flatnonzero(mask).tolist()
 
     def step(self, actions: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray, dict[str, Any]]:
-        """One control step of the active drones; the others begin their next episode.
+        """One control step of the active drones; the others do as the autoreset mode says.
 
         actions (E,). Returns observations (E, 4, 84, 84), rewards (E,), terminated (E,),
         truncated (E,) and infos in Gymnasium's form for vectors. Raises ValueError for actions of
-        another shape or outside the space; then no drone has moved.
+        another shape or outside the space, and in "Disabled" if an episode is over; then no drone
+        has moved.
         """
+        drones, rewards = self.envs.drones, np.zeros(self.num_envs)  # (E,)
         if actions not in self.action_space:
             raise ValueError(f"actions are {actions}, allowed: {self.action_space}")
-        rewards = np.zeros(self.num_envs)  # (E,)
-        for i, drone in enumerate(self.envs.drones):
+        if self.mode is AutoresetMode.DISABLED and any(drone.outcome for drone in drones):
+            raise ValueError("an episode is over: reset its drone by a reset_mask")
+        for i, drone in enumerate(drones):
             if drone.outcome:
                 begin(self, drone, None)
             else:
                 rewards[i] = drone.step(int(actions[i]))
-        outcomes = np.array([drone.outcome for drone in self.envs.drones])  # (E,)
+        outcomes = np.array([drone.outcome for drone in drones])  # (E,)
         terminated, truncated = ~np.isin(outcomes, ("", "time")), outcomes == "time"  # (E,), (E,)
-        return look(self.envs), rewards, terminated, truncated, self._infos()
+        infos = self._begin_next() if self.mode is AutoresetMode.SAME_STEP else {}
+        infos = self._infos(range(self.num_envs), infos)
+        return look(self.envs), rewards, terminated, truncated, infos
+
+    def _begin_next(self) -> dict[str, Any]:
+        """Begin the next episode where one is over; returns the infos of what has ended."""
+        infos: dict[str, Any] = {}
+        for i, drone in enumerate(self.envs.drones):
+            if drone.outcome:
+                final = {"final_obs": drone.observation, "final_info": info(drone)}
+                infos = self._add_info(infos, final, i)
+                begin(self, drone, None)
+        return infos
 
     def render(self) -> tuple[ndarray, ...] | None:
         """The picture of each drone, if there is a render mode."""
         return tuple(picture(drone) for drone in self.envs.drones) if self.render_mode else None
 
-    def _infos(self) -> dict[str, Any]:
-        infos: dict[str, Any] = {}
-        for i, drone in enumerate(self.envs.drones):
-            infos = self._add_info(infos, info(drone), i)
+    def _infos(self, chosen: Sequence[int], infos: dict[str, Any]) -> dict[str, Any]:
+        for i in chosen:
+            infos = self._add_info(infos, info(self.envs.drones[i]), i)
         return infos
 
 
@@ -215,6 +257,7 @@ def main() -> None:
     while not any(env.step(env.action_space.sample())[2:4]):
         pass
     env.close()
+    print("wrote runs/gym/random-episode-0.mp4")
 
 
 if __name__ == "__main__":

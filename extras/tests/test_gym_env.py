@@ -1,6 +1,7 @@
 """The Gymnasium environment passes both checkers and works with what people wrap around it."""
 
 import warnings
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -10,7 +11,7 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from env import VecForest, World
-from extras.bridges.gym_env import ID, Forest
+from extras.bridges.gym_env import ID, Forest, main
 
 
 @pytest.mark.parametrize("check", [check_env, check_env_sb3])
@@ -138,3 +139,57 @@ def test_a_world_is_changed_by_keywords_and_an_impossible_one_refused() -> None:
         Forest(speed=50.0)
     with pytest.raises(ValueError, match="render_mode is 'human'"):
         Forest(render_mode="human")
+
+
+def test_the_film_is_where_the_script_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    main()
+    told = capsys.readouterr().out.splitlines()[-1]
+    film = tmp_path / told.removeprefix("wrote ")
+    assert [*(tmp_path / "runs/gym").glob("*.mp4")] == [film]
+
+
+def test_an_episode_is_a_success_if_the_drone_crossed() -> None:
+    for back, length, goal, end in (
+        (2.0, 20.0, 3.0, "goal"), (2.0, 2.8, 0.1, "far"), (-1.0, 90.0, 3.0, "back")
+    ):  # fmt: skip
+        env, told = Forest(grid=(0, 0), back=back, length=length, goal_radius=goal), []
+        env.reset(seed=1)
+        while not env.drone.outcome:
+            told.append(env.step(4)[4])
+        assert told[-1]["outcome"] == end and told[-1]["is_success"] is (end != "back")
+        assert not any(info["is_success"] for info in told[:-1])
+
+
+def test_no_key_and_opposite_keys_fly_straight_on_and_every_other_set_of_keys_turns() -> None:
+    keys = {"".join(sorted(key)): action for key, action in Forest().get_keys_to_action().items()}
+    assert keys == {
+        "": 4, "w": 4, "ad": 4, "adw": 4, "a": 8, "aw": 6, "dw": 2, "d": 0
+    }  # fmt: skip
+    few = Forest(num_actions=3)
+    assert {*few.get_keys_to_action().values()} <= {0, 1, 2}
+    assert few.get_keys_to_action()[""] == 1 and few.get_keys_to_action()["a"] == 2
+
+
+def test_gymnasium_s_play_flies_by_the_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of matplotlib, which it would plot with
+        from gymnasium.utils.play import play
+    env, flown = gymnasium.make(ID, render_mode="rgb_array"), []
+    down, up = pygame.KEYDOWN, pygame.KEYUP
+    presses = [[(down, "a")], [(down, "w")], [(up, "a"), (down, "d")], [(up, "w"), (up, "d")]]
+
+    def press(*step: object) -> None:
+        """Note the action, and press what comes next; in the end close the window."""
+        flown.append(step[2])
+        for kind, key in presses[len(flown) - 1] if len(flown) <= len(presses) else ():
+            pygame.event.post(pygame.event.Event(kind, key=ord(key)))
+        if len(flown) > len(presses):
+            pygame.event.post(pygame.event.Event(pygame.QUIT))
+
+    play(env, fps=1000, callback=press, seed=1)
+    assert flown == [4, 8, 6, 2, 4]

@@ -5,7 +5,7 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from env import VecForest, World
@@ -31,6 +31,9 @@ def same(ours: dict, theirs: dict) -> None:
     """Both infos have the same keys, masks, types and values."""
     assert ours.keys() == theirs.keys()
     for key, value in ours.items():
+        if isinstance(value, dict):
+            same(value, theirs[key])
+            continue
         assert value.dtype == theirs[key].dtype and np.array_equal(value, theirs[key]), key
 
 
@@ -124,11 +127,132 @@ def test_equal_seeds_give_training_and_validation_different_forests() -> None:
     assert np.all((flown["validation"] >= 10**9) & (flown["validation"] < 2 * 10**9))
 
 
-def test_the_native_vector_takes_gymnasiums_time_limit_or_the_worlds() -> None:
-    for limits, end in (({}, 1000), ({"max_episode_steps": 2}, 2), ({"max_steps": 2000}, 2000)):
-        envs = gymnasium.make_vec(ID, num_envs=2, **limits)
-        assert envs.envs.world.max_steps == end
-    assert gymnasium.make_vec(ID, num_envs=2).spec.max_episode_steps == 1000
+@pytest.mark.parametrize(
+    ("limits", "end"),
+    [({}, 1000), ({"max_steps": 1003}, 1000), ({"max_episode_steps": 1003}, 1000),
+     ({"max_steps": 3}, 3), ({"max_episode_steps": 3}, 3),
+     ({"max_steps": 3, "max_episode_steps": 5}, 3), ({"max_steps": 5, "max_episode_steps": 3}, 3),
+     ({"max_steps": 1003, "max_episode_steps": 1003}, 1003),
+     ({"max_steps": 1003, "max_episode_steps": -1}, 1003)],
+)  # fmt: skip
+def test_the_smaller_time_limit_ends_an_episode_alone_and_in_a_vector(
+    limits: dict[str, int], end: int
+) -> None:
+    world = {"grid": (0, 0), "back": 30.0} | limits  # no trunk is in the way of a circle
+    alone, envs = gymnasium.make(ID, **world), gymnasium.make_vec(ID, num_envs=1, **world)
+    alone.reset(seed=1)
+    envs.reset(seed=1)
+    ends = [(alone.step(8)[3], envs.step(np.array([8]))[3][0]) for _ in range(end)]
+    assert not np.any(ends[:-1]) and all(ends[-1])
+    assert envs.spec.max_episode_steps == 1000
+
+
+def pair(**kwargs: object) -> tuple[Forests, SyncVectorEnv]:
+    """Our vector of three, and Gymnasium's of three in the same mode."""
+    mode = kwargs.pop("autoreset_mode", "NextStep")
+    ours = gymnasium.make_vec(ID, num_envs=3, autoreset_mode=mode, **kwargs)
+    options = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
+    return ours, gymnasium.make_vec(ID, num_envs=3, **options, **kwargs)
+
+
+def test_a_mask_resets_its_drones_and_no_other_as_in_gymnasium() -> None:
+    ours, theirs = pair(autoreset_mode="Disabled", max_steps=4)
+    assert ours.metadata["autoreset_mode"] is AutoresetMode.DISABLED
+    same_step(ours.reset(seed=40), theirs.reset(seed=40))
+    actions = np.array([0, 4, 8])
+    for mask, seed in (([False, True, False], 7), ([True, False, True], [9, None, 3])):
+        same_step(ours.step(actions), theirs.step(actions))
+        options = [{"reset_mask": np.array(mask)} for _ in range(2)]  # theirs empties it
+        a = ours.reset(seed=seed, options=options[0])
+        same_step(a, theirs.reset(seed=seed, options=options[1]))
+        assert list(a[1]["_forest"]) == mask
+    assert [len(drone.actions) for drone in ours.envs.drones] == [0, 1, 0]
+    assert list(a[1]["forest"]) == [9, 0, 3] and ours.envs.drones[1].seed == 8
+
+
+def test_where_autoreset_is_disabled_a_drone_waits_for_its_mask() -> None:
+    envs = Forests(2, max_steps=2, autoreset_mode="Disabled")
+    envs.reset(seed=1)
+    envs.step(np.array([4, 4]))
+    envs.reset(options={"reset_mask": np.array([True, False])})
+    assert list(envs.step(np.array([4, 4]))[3]) == [False, True]
+    with pytest.raises(ValueError, match="reset_mask"):
+        envs.step(np.array([4, 4]))
+    assert [len(drone.actions) for drone in envs.envs.drones] == [1, 2]
+    envs.reset(options={"reset_mask": np.array([False, True])})
+    envs.step(np.array([4, 4]))
+
+
+def test_a_mask_begins_the_next_episode_in_place_of_the_next_step() -> None:
+    envs = Forests(2, max_steps=1)
+    envs.reset(seed=1)
+    envs.step(np.array([4, 4]))
+    envs.reset(seed=[5, None], options={"reset_mask": np.array([True, False])})
+    _, rewards, _, truncated, infos = envs.step(np.array([4, 4]))
+    assert infos["forest"][0] == 5 and rewards[0] != 0 and truncated[0]
+    assert infos["progress"][1] == rewards[1] == 0 and not truncated[1]
+
+
+@pytest.mark.parametrize("mask", [[True], [False, False], [1, 0], np.array(True), "yes"])
+def test_a_mask_that_means_no_drone_is_refused_and_changes_nothing(mask: object) -> None:
+    envs = Forests(2)
+    with pytest.raises(ValueError, match="never reset"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    envs.reset(seed=3)
+    with pytest.raises(ValueError, match="allowed: 2 bools"):
+        envs.reset(seed=7, options={"reset_mask": mask})
+    assert [drone.seed for drone in envs.envs.drones] == [3, 4]
+
+
+def same_step(ours: tuple, theirs: tuple) -> None:
+    """Both have answered a reset or a step alike."""
+    for x, y in zip(ours[:-1], theirs[:-1], strict=True):
+        assert x.dtype == y.dtype and np.array_equal(x, y)
+    same(ours[-1], theirs[-1])
+
+
+def test_same_step_autoreset_flies_as_gymnasiums() -> None:
+    (ours, theirs), ends = pair(autoreset_mode="SameStep", max_steps=30), 0
+    assert ours.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert Forests(1).metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    same_step(ours.reset(seed=40), theirs.reset(seed=40))
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        actions = rng.integers(9, size=3)
+        a = ours.step(actions)
+        for i in range(3):  # lead theirs into the forest that ours has drawn
+            forest = int(a[4]["forest"][i])
+            theirs.envs[i].unwrapped.numbers = range(forest, forest + 1)
+        b = theirs.step(actions)
+        over = a[2] | a[3]
+        assert ("final_obs" in a[4]) == over.any()
+        for i in np.flatnonzero(over):
+            assert np.array_equal(a[4]["final_obs"][i], b[4]["final_obs"][i])
+            assert not a[4]["is_success"][i] and a[4]["progress"][i] == 0
+        for infos in (a[4], b[4]):
+            infos.pop("final_obs", None)
+        same_step(a, b)
+        ends += over.sum()
+    assert ends > 9
+
+
+def test_the_statistics_of_a_vector_begin_anew_where_a_mask_does() -> None:
+    envs = RecordEpisodeStatistics(Forests(2, max_steps=3, autoreset_mode="Disabled"))
+    envs.reset(seed=1)
+    envs.step(np.array([4, 4]))
+    envs.reset(options={"reset_mask": np.array([True, False])})
+    lengths = []
+    for mask in ([False, True], [True, False]):
+        while not np.any((step := envs.step(np.array([4, 4])))[3]):
+            pass
+        lengths.append(list(step[4]["episode"]["l"]))
+        envs.reset(options={"reset_mask": np.array(mask)})
+    assert lengths == [[0, 3], [3, 0]]
+
+
+def test_an_unknown_autoreset_mode_is_refused() -> None:
+    with pytest.raises(ValueError, match="'Sometimes'"):
+        gymnasium.make_vec(ID, num_envs=2, autoreset_mode="Sometimes")
 
 
 def test_the_statistics_of_a_vector_are_the_sums_of_its_rewards() -> None:
