@@ -5,9 +5,8 @@
     extras/.venv/bin/python -m extras.bridges.export_onnx --camera disparity
     extras/.venv/bin/python -m extras.bridges.export_onnx --weights runs/a/best.pt
 
-The last one writes runs/a/best.onnx; `--out` names another file. Of the files that are there it
-replaces only an export of its own, which it knows by the metadata: `pilot`, `run`, `camera`,
-`beacon`, and the whole `world` as JSON.
+The last one writes runs/a/best.onnx. A file that exists is replaced only if `--out` names it. The
+export's metadata say what it is: `pilot`, `run`, `camera`, `beacon`, and as JSON the whole `world`.
 
 Input `observation` (B, 4, 84, 84) uint8, output `q` (B, 9) float32, any B; the action is the
 argmax. The script then flies validation forests, half of the drones at random, and holds the
@@ -42,7 +41,6 @@ from itertools import count
 from pathlib import Path
 
 import numpy as np
-import onnx
 import onnxruntime
 import torch
 from numpy import ndarray
@@ -56,43 +54,18 @@ ROOT, SIZE = Path(__file__).parents[2], 1000
 WARMUP, CALLS = 50, 1000  # decisions before and in a timing
 
 
-def label(weights: Path, world: World, pilot: str) -> dict[str, str]:
-    """What an export says of itself: its pilot, its run, and the world that it was trained for."""
-    where = {"pilot": pilot, "run": "/".join(weights.resolve().parts[-2:])}
-    seen = {"camera": world.camera, "beacon": json.dumps(world.beacon)}
-    return where | seen | {"world": json.dumps(asdict(world))}
-
-
-def check_free(path: Path) -> None:
-    """InputError if an export would replace a file that is none."""
-    try:
-        keys = {each.key for each in onnx.load(path).metadata_props}
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    except Exception:  # a foreign file can fail in any way
-        keys = set()
-    if not keys >= {"pilot", "run", "world"}:
-        raise InputError(f"{path} is there and no export of this script: give another --out")
-
-
 def export(q: QNetwork, path: Path, metadata: dict[str, str]) -> None:
     """Write the network as one ONNX file, its weights inside."""
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, we do not
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # torch warns of itself
         program = torch.onnx.export(
-            q.eval(),
-            (torch.zeros(2, 4, 84, 84, dtype=torch.uint8),),
-            dynamo=True,
-            opset_version=18,
-            verbose=False,
-            input_names=["observation"],
-            output_names=["q"],
+            q.eval(), (torch.zeros(2, 4, 84, 84, dtype=torch.uint8),), dynamo=True,
+            opset_version=18, verbose=False, input_names=["observation"], output_names=["q"],
             dynamic_shapes=({0: torch.export.Dim("batch")},),
-        )
+        )  # fmt: skip
     program.model.ir_version = 9  # the newest that onnxruntime 1.17 reads, on a Jetson
     program.model.metadata_props.update(metadata)
-    path.parent.mkdir(parents=True, exist_ok=True)
     save(path, program.model_proto.SerializeToString())
 
 
@@ -152,8 +125,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     path = args.out or beside
     try:
         q, world, pilot = load_weights(weights)
-        check_free(path)
-        export(q, path, label(weights, world, pilot))
+        if path.suffix != ".onnx":  # so that a slip replaces no weights
+            raise InputError(f"--out is {path}, but must end in .onnx")
+        if path.exists() and not args.out:
+            raise InputError(f"{path} exists: to replace it, name it by --out")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.open("ab").close()  # so that a folder is an error too
+        what = {"pilot": pilot, "run": "/".join(weights.resolve().parts[-2:])}
+        what |= {"camera": world.camera, "beacon": json.dumps(world.beacon)}
+        export(q, path, what | {"world": json.dumps(asdict(world))})
     except (InputError, OSError) as error:
         print(f"export_onnx: {error}", file=sys.stderr)
         return 2

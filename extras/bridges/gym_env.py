@@ -183,7 +183,7 @@ class Forests(VectorEnv):
         super().reset(seed=next((pairs[i][1] for i in chosen if pairs[i][1] is not None), None))
         for i in chosen:
             begin(self, *pairs[i])
-        return look(self.envs), self._infos(chosen, {})
+        return look(self.envs), self._infos(chosen)
 
     def _chosen(self, mask: ndarray | None) -> Sequence[int]:
         """Which drones a mask (E,) means, by number. ValueError if it is none, or names none."""
@@ -216,27 +216,23 @@ class Forests(VectorEnv):
                 rewards[i] = drone.step(int(actions[i]))
         outcomes = np.array([drone.outcome for drone in drones])  # (E,)
         terminated, truncated = ~np.isin(outcomes, ("", "time")), outcomes == "time"  # (E,), (E,)
-        infos = self._begin_next() if self.mode is AutoresetMode.SAME_STEP else {}
-        infos = self._infos(range(self.num_envs), infos)
+        infos = self._infos(range(self.num_envs))
         return look(self.envs), rewards, terminated, truncated, infos
-
-    def _begin_next(self) -> dict[str, Any]:
-        """Begin the next episode where one is over; returns the infos of what has ended."""
-        infos: dict[str, Any] = {}
-        for i, drone in enumerate(self.envs.drones):
-            if drone.outcome:
-                final = {"final_obs": drone.observation, "final_info": info(drone)}
-                infos = self._add_info(infos, final, i)
-                begin(self, drone, None)
-        return infos
 
     def render(self) -> tuple[ndarray, ...] | None:
         """The picture of each drone, if there is a render mode."""
         return tuple(picture(drone) for drone in self.envs.drones) if self.render_mode else None
 
-    def _infos(self, chosen: Sequence[int], infos: dict[str, Any]) -> dict[str, Any]:
+    def _infos(self, chosen: Sequence[int]) -> dict[str, Any]:
+        """Infos of these drones; in "SameStep" the next episode begins where one is over."""
+        infos: dict[str, Any] = {}
         for i in chosen:
-            infos = self._add_info(infos, info(self.envs.drones[i]), i)
+            drone = self.envs.drones[i]
+            if drone.outcome and self.mode is AutoresetMode.SAME_STEP:
+                final = {"final_obs": drone.observation, "final_info": info(drone)}
+                infos = self._add_info(infos, final, i)
+                begin(self, drone, None)
+            infos = self._add_info(infos, info(drone), i)
         return infos
 
 

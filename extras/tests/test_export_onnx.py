@@ -1,4 +1,4 @@
-"""The exported network is the trained one, says which, and replaces nothing but an export."""
+"""The exported network is the trained one, says which, and replaces no other file unasked."""
 
 import json
 import shutil
@@ -69,27 +69,26 @@ def test_two_runs_make_two_files_that_say_what_they_are(tmp_path: Path) -> None:
     assert (world["speed"], world["dt"]) == (World.speed, World.dt)
 
 
-def test_an_export_replaces_an_export_and_no_other_file(
+def test_a_file_that_exists_is_replaced_only_if_it_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "new" / "x.onnx"
-    assert main(["--out", str(out)]) == main(["--beacon", "--out", str(out)]) == 0
+    weights, out = tmp_path / "best.pt", tmp_path / "best.onnx"
+    shutil.copy(ROOT / "weights/dqn-beacon.pt", weights)
+    out.write_text("mine")
+    assert main(["--weights", str(weights)]) == 2
+    assert out.read_text() == "mine"
+    assert (
+        capsys.readouterr().err == f"export_onnx: {out} exists: to replace it, name it by --out\n"
+    )
+    assert main(["--weights", str(weights), "--out", str(tmp_path)]) == 2
+    assert main(["--weights", str(weights), "--out", str(out)]) == 0
     assert ("beacon", "true") in {(p.key, p.value) for p in onnx.load(out).metadata_props}
-    capsys.readouterr()
-    foreign = tmp_path / "foreign.onnx"
-    export(QNetwork(9), foreign, {"author": "somebody"})
-    for path in (foreign, tmp_path / "notes.txt"):
-        path.touch()
-        before = path.read_bytes()
-        assert main(["--out", str(path)]) == 2
-        assert path.read_bytes() == before
-        assert capsys.readouterr().err.startswith(f"export_onnx: {path} is there and no export")
 
 
 @pytest.mark.parametrize(
     ("words", "why"),
     [("--weights none.pt", "No such file"), ("--weights README.md", "another kind of file"),
-     ("--weights weights/drqn.pt", "another network"), ("--out .", "no export"),
+     ("--weights weights/drqn.pt", "another network"), ("--out weights/dqn.pt", "end in .onnx"),
      ("--out README.md/x.onnx", "README.md"), ("--camera red", "'red'"), ("--beacon 1", "1")],
 )  # fmt: skip
 def test_a_bad_command_line_gets_one_line_and_writes_nothing(
