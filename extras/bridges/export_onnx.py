@@ -1,6 +1,5 @@
 """Export a trained network to ONNX, for where there is no torch: the paper's next step was a drone.
 
-    extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.bridges.export_onnx      # weights/dqn.pt -> runs/dqn.onnx
     extras/.venv/bin/python -m extras.bridges.export_onnx --camera disparity
     extras/.venv/bin/python -m extras.bridges.export_onnx --weights runs/a/best.pt

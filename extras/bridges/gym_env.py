@@ -1,18 +1,16 @@
 """The forest for Gymnasium: `DeepFlight/Forest-v0`. The paper's authors released one for Gym.
 
-    extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.bridges.gym_env     # films an episode to runs/gym/
 
     import gymnasium, extras.bridges.gym_env                     # from the root of the repository
     env = gymnasium.make("DeepFlight/Forest-v0", render_mode="rgb_array", beacon=True)
     observation, info = env.reset(seed=3_000_000_000)
     envs = gymnasium.make_vec("DeepFlight/Forest-v0", num_envs=8)
-    gymnasium.utils.play.play(env)           # if you import it, and have pygame: keys a, d and w
+    from gymnasium.utils.play import play; play(env)             # keys a, d and w; needs pygame
 
 Observation: Box(0, 255, (4, 84, 84), uint8), oldest frame first. Action: Discrete(9), 0 turns
 right, 8 left. Every field of env.World is a keyword argument. The smaller of `max_steps`, the
-world's, and `max_episode_steps`, Gymnasium's, truncates. Both are 1,000: for longer episodes give
-`make` or `make_vec` both.
+world's, and `max_episode_steps`, Gymnasium's, truncates; for more than 1,000 steps give both.
 
 A seed is a forest. `reset(seed=k)` plants forest k, the same that `deepflight.py eval` flies as k.
 A reset without a seed draws one below 10^9, the range of training, from the environment's own
@@ -20,18 +18,13 @@ generator. `info["forest"]` says which: keep it and the actions, and you can fly
 
 With `forests="validation"` every forest comes from [10^9, 2 * 10^9). A reset without a seed draws
 one there, and `reset(seed=k)` plants forest 10^9 + k % 10^9. So it shares no forest with a training
-whose seeds are below 10^9, even if both get the same seeds, as from Stable-Baselines3:
-
-    EvalCallback(Monitor(gymnasium.make("DeepFlight/Forest-v0", forests="validation")))
+whose seeds are below 10^9, even if Stable-Baselines3 gives both the same seeds. Its EvalCallback
+meets other forests each time, unless you call `eval_env.seed(0)` before: see sb3_train.Validation.
 
 `make_vec` gives drones side by side. `reset(seed=k)` plants forests k, k + 1, and so on; with
-`options={"reset_mask": mask}` only those of the mask (E,), as in Gymnasium's own vectors. The
-keyword `autoreset_mode` says what follows the end of an episode:
-
-    "NextStep"  the next step begins the next one, ignores its action, and pays 0; the default
-    "SameStep"  the next one begins at once; infos keep the end as `final_obs` and `final_info`
-                (RecordEpisodeStatistics of Gymnasium 1.2 then counts a step too few)
-    "Disabled"  nothing: reset that drone, by a mask, before the next step
+`options={"reset_mask": mask}` only those of the mask (E,). The keyword `autoreset_mode` is one of
+Gymnasium's: "NextStep" (the default: the step after an episode's end begins the next one, ignores
+its action, and pays 0), "SameStep" or "Disabled".
 """
 
 from collections.abc import Sequence
@@ -186,15 +179,13 @@ class Forests(VectorEnv):
         return look(self.envs), self._infos(chosen)
 
     def _chosen(self, mask: ndarray | None) -> Sequence[int]:
-        """Which drones a mask (E,) means, by number. ValueError if it is none, or names none."""
+        """The drones that begin anew: those of the mask (E,), and any that never began."""
         if mask is None:
             return range(self.num_envs)
         mask, never = np.asarray(mask), [drone.outcome == "not reset" for drone in self.envs.drones]
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise ValueError(f"reset_mask is {mask}, allowed: {self.num_envs} bools, not all False")
-        if np.any(never & ~mask):
-            raise ValueError(f"reset_mask is {mask}: it leaves out a drone that was never reset")
-        return np.flatnonzero(mask).tolist()
+        return np.flatnonzero(mask | never).tolist()
 
     def step(self, actions: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray, dict[str, Any]]:
         """One control step of the active drones; the others do as the autoreset mode says.

@@ -1,6 +1,5 @@
 """Train on Ray RLlib's DQN, where one machine is not enough, and fly the result in our `eval`.
 
-    extras/.venv/bin/pip install -r extras/requirements.txt
     extras/.venv/bin/python -m extras.bridges.rllib_train --runners 2 --steps 100000  # a Ray here
     extras/.venv/bin/python -m extras.bridges.rllib_train --runners 64 --address HOST:6379  # join
     extras/.venv/bin/python deepflight.py eval --weights runs/rllib.pt
@@ -16,7 +15,7 @@ replay of 50,000 transitions lies in this machine's memory; Ray logs to ~/ray_re
 
 At the end the script prints how many steps a second each node added. If a node dies, the others fly
 on, and its runners start again where a CPU is free. The node of this script must live: it holds the
-learner and the replay. A test kills one of three nodes midway, all on one machine.
+learner and the replay; Ctrl-C, SIGTERM, SIGUSR1 write the weights. A test kills one of three nodes.
 
 We did not try a cluster of several machines. There, start Ray on every machine (`ray start --head`
 on one, `ray start --address HOST:6379` on the others), with this Python and these packages on each,
@@ -48,6 +47,7 @@ from torch import Tensor, nn
 from deepflight import Config, save_weights
 from dqn import InputError, QNetwork
 from extras.bridges.gym_env import ID, Forest
+from extras.bridges.signals import ended_by_signals
 
 ROOT = Path(__file__).parents[2]
 ENVS = 4  # drones of a runner
@@ -100,19 +100,12 @@ def make_config(c: Config, runners: int) -> RayConfig:
         target_network_update_freq=c.target_every, adam_epsilon=ADAM_EPSILON,
         replay_buffer_config=replay,
     )  # fmt: skip
-    return (
-        RayConfig()
-        .environment(ID)
-        .env_runners(
-            num_env_runners=runners, num_envs_per_env_runner=ENVS, rollout_fragment_length=c.n_steps
-        )
-        .callbacks(on_sample_end=count)
-        # A lost runner starts again where a CPU is free; until then the others fly on.
-        .fault_tolerance(restart_failed_env_runners=True, env_runner_health_probe_timeout_s=PROBE)
-        .rl_module(rl_module_spec=RLModuleSpec(module_class=Nature))
-        .training(**learning)
-        .debugging(seed=c.seed)
-    )
+    flying = {"num_env_runners": runners, "num_envs_per_env_runner": ENVS}
+    config = RayConfig().environment(ID).training(**learning).debugging(seed=c.seed)
+    config.env_runners(**flying, rollout_fragment_length=c.n_steps).callbacks(on_sample_end=count)
+    # A lost runner starts again where a CPU is free; until then the others fly on.
+    config.fault_tolerance(restart_failed_env_runners=True, env_runner_health_probe_timeout_s=PROBE)
+    return config.rl_module(rl_module_spec=RLModuleSpec(module_class=Nature))
 
 
 def network(algorithm: Algorithm) -> QNetwork:
@@ -124,27 +117,38 @@ def network(algorithm: Algorithm) -> QNetwork:
     return q
 
 
-def train(c: Config, runners: int, out: Path) -> None:
-    """Train for c.steps, with a line each thousand steps or so, and write the weights."""
+def train(c: Config, runners: int, out: Path) -> int:
+    """Train, and write the weights, even if a signal ends it. Returns 0, or 128 + the signal."""
     register_env(ID, lambda _context: Forest(beacon=c.beacon))
-    algorithm, steps = make_config(c, runners).build_algo(), 0
+    algorithm, end = make_config(c, runners).build_algo(), ""
+    with ended_by_signals() as stopped:
+        try:
+            learn(algorithm, c.steps)
+        except KeyboardInterrupt:
+            end = "\ninterrupted; "
+        save_weights(out, network(algorithm), c)
+        print(f"{end}wrote {out}; fly it: python deepflight.py eval --weights {out}", flush=True)
+    algorithm.stop()
+    return 128 + stopped[0] if stopped else 0
+
+
+def learn(algorithm: Algorithm, total: int) -> None:
+    """Train for so many steps, with a line each thousand or so."""
+    steps = 0
     nodes: dict[str, dict[str, float]] = {}  # steps of each runner on each node
     busy: Counter[str] = Counter()  # s in which each node flew
-    while steps < c.steps:
+    while steps < total:
         result = algorithm.train()
         flown, seconds, before = result["env_runners"], result["time_total_s"], nodes
         nodes = {node: dict(each) for node, each in flown["nodes"].items()}
         live = [node for node in nodes if nodes[node] != before.get(node)]
         busy.update(dict.fromkeys(live, result["time_this_iter_s"]))
         steps = int(flown["num_env_steps_sampled_lifetime"])
-        left = max(c.steps - steps, 0) * seconds / steps / 60
+        left = max(total - steps, 0) * seconds / steps / 60
         text = f"{steps:9,} steps, {steps / seconds:5.0f} a second, {left:5.1f} min left"
         text += f", {algorithm.env_runner_group.num_healthy_remote_env_runners()} runners"
         print(f"{text}, episodes of {flown.get('episode_len_mean', 0):.1f} steps", flush=True)
     report(nodes, busy, live)
-    save_weights(out, network(algorithm), c)
-    algorithm.stop()
-    print(f"wrote {out}; fly it: python deepflight.py eval --weights {out}")
 
 
 def report(nodes: dict[str, dict[str, float]], busy: Counter[str], live: list[str]) -> None:
@@ -190,11 +194,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default="runs/rllib.pt", help="the weights' file")
     args = parser.parse_args(argv)
     try:
-        c = RLlibConfig(steps=args.steps, beacon=args.beacon)
+        starts = min(Config.learning_starts, args.steps // 2)  # so that it learns something
+        c = RLlibConfig(steps=args.steps, beacon=args.beacon, learning_starts=starts)
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.open("ab").close()  # better to fail now than after the training
         start(args.address, args.runners)
-        train(c, args.runners, args.out)
+        return train(c, args.runners, args.out)
     except (InputError, RuntimeError, OSError, RayError) as error:
         print(f"rllib_train: {str(error).strip().splitlines()[-1]}", file=sys.stderr)
         return 2
@@ -203,7 +208,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     finally:
         ray.shutdown()
-    return 0
 
 
 if __name__ == "__main__":

@@ -196,8 +196,6 @@ def test_a_mask_begins_the_next_episode_in_place_of_the_next_step() -> None:
 @pytest.mark.parametrize("mask", [[True], [False, False], [1, 0], np.array(True), "yes"])
 def test_a_mask_that_means_no_drone_is_refused_and_changes_nothing(mask: object) -> None:
     envs = Forests(2)
-    with pytest.raises(ValueError, match="never reset"):
-        envs.reset(options={"reset_mask": np.array([True, False])})
     envs.reset(seed=3)
     with pytest.raises(ValueError, match="allowed: 2 bools"):
         envs.reset(seed=7, options={"reset_mask": mask})
@@ -248,6 +246,11 @@ def test_the_statistics_of_a_vector_begin_anew_where_a_mask_does() -> None:
         lengths.append(list(step[4]["episode"]["l"]))
         envs.reset(options={"reset_mask": np.array(mask)})
     assert lengths == [[0, 3], [3, 0]]
+
+
+def test_a_mask_before_all_drones_have_begun_leaves_none_out() -> None:
+    infos = Forests(2).reset(seed=3, options={"reset_mask": np.array([True, False])})[1]
+    assert list(infos["forest"]) == [3, 4]
 
 
 def test_an_unknown_autoreset_mode_is_refused() -> None:
