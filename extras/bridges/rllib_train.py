@@ -16,6 +16,7 @@ replay of 50,000 transitions lies in this machine's memory; Ray logs to ~/ray_re
 At the end the script prints how many steps a second each node added. If a node dies, the others fly
 on, and its runners start again where a CPU is free. The node of this script must live: it holds the
 learner and the replay; Ctrl-C, SIGTERM, SIGUSR1 write the weights. A test kills one of three nodes.
+Send a signal to this script alone: if Ray's own processes end first, they end it unsaved.
 
 We did not try a cluster of several machines. There, start Ray on every machine (`ray start --head`
 on one, `ray start --address HOST:6379` on the others), with this Python and these packages on each,

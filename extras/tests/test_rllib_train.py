@@ -5,6 +5,7 @@ Every test but those of the command line is long.
 
 import os
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -51,7 +52,7 @@ def test_a_training_on_three_nodes_outlives_one_of_them(tmp_path: Path) -> None:
             cluster.add_node(num_cpus=1)
         command = [sys.executable, "-m", "extras.bridges.rllib_train", "--runners", "3"]
         command += ["--address", cluster.address, "--out", str(out)]
-        command += ["--steps", "5100"]  # the last hundred learn
+        command += ["--steps", "5100"]  # in the second half it learns
         environ = os.environ | {"OMP_NUM_THREADS": "1"}  # the runners need the other cores
         with subprocess.Popen(
             command, cwd=ROOT, env=environ, stdout=subprocess.PIPE, text=True
@@ -74,6 +75,22 @@ def test_a_training_on_three_nodes_outlives_one_of_them(tmp_path: Path) -> None:
     pilot = ["eval", "--weights", str(out), "--episodes", "2"]
     command = [sys.executable, "deepflight.py", *pilot, "--out", str(tmp_path)]
     subprocess.run(command, cwd=ROOT, check=True)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGUSR1"])
+def test_a_signal_saves_the_weights_so_far(name: str, tmp_path: Path) -> None:
+    out, number = tmp_path / "rllib.pt", getattr(signal, name)
+    command = [sys.executable, "-m", "extras.bridges.rllib_train", "--runners", "1"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([*command, "--out", str(out)], cwd=ROOT, **pipes) as training:
+        shown = next(line for line in training.stdout if PASSED.match(line))
+        training.send_signal(number)
+        rest, errors = training.communicate()
+    assert training.returncode == 128 + number and shown
+    assert "Traceback" not in errors
+    assert re.match(r"interrupted; wrote \S+; fly it: ", rest.splitlines()[-1])
+    assert load_weights(out)[1:] == (World(), "rllib")
 
 
 def exit_code(words: str) -> int:
