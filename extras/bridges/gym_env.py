@@ -141,18 +141,18 @@ class Forests(VectorEnv):
     """E drones side by side.
 
     The arguments are those of Forest, and two of Gymnasium's: max_episode_steps, the time limit
-    that make_vec passes on (-1: none), and autoreset_mode, an AutoresetMode or its value.
+    that make_vec passes on (-1: none; None: 1,000), and autoreset_mode, an AutoresetMode or value.
     """
 
     metadata: ClassVar[dict[str, Any]] = RENDER | {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(
         self, num_envs: int = 1, render_mode: str | None = None, *, forests: str = "training",
-        max_episode_steps: int = -1, autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        **world: Any,
+        max_episode_steps: int | None = -1,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP, **world: Any,
     ) -> None:  # fmt: skip
-        limit, theirs = world.get("max_steps", World.max_steps), max_episode_steps
-        world["max_steps"] = limit if theirs == -1 else min(limit, theirs)
+        ours, theirs = world.get("max_steps", World.max_steps), max_episode_steps or World.max_steps
+        world["max_steps"] = ours if theirs == -1 else min(ours, theirs)
         dress(self, World(**world), num_envs, render_mode, forests)
         self.num_envs, self.mode = num_envs, AutoresetMode(autoreset_mode)
         self.metadata = self.metadata | {"autoreset_mode": self.mode}

@@ -195,8 +195,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default="runs/rllib.pt", help="the weights' file")
     args = parser.parse_args(argv)
     try:
-        starts = min(Config.learning_starts, args.steps // 2)  # so that it learns something
-        c = RLlibConfig(steps=args.steps, beacon=args.beacon, learning_starts=starts)
+        c = RLlibConfig(steps=args.steps, beacon=args.beacon)
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.open("ab").close()  # better to fail now than after the training
         start(args.address, args.runners)

@@ -133,7 +133,8 @@ def test_equal_seeds_give_training_and_validation_different_forests() -> None:
      ({"max_steps": 3}, 3), ({"max_episode_steps": 3}, 3),
      ({"max_steps": 3, "max_episode_steps": 5}, 3), ({"max_steps": 5, "max_episode_steps": 3}, 3),
      ({"max_steps": 1003, "max_episode_steps": 1003}, 1003),
-     ({"max_steps": 1003, "max_episode_steps": -1}, 1003)],
+     ({"max_steps": 1003, "max_episode_steps": -1}, 1003),
+     ({"max_steps": 1003, "max_episode_steps": None}, 1000)],
 )  # fmt: skip
 def test_the_smaller_time_limit_ends_an_episode_alone_and_in_a_vector(
     limits: dict[str, int], end: int

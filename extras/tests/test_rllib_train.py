@@ -52,7 +52,7 @@ def test_a_training_on_three_nodes_outlives_one_of_them(tmp_path: Path) -> None:
             cluster.add_node(num_cpus=1)
         command = [sys.executable, "-m", "extras.bridges.rllib_train", "--runners", "3"]
         command += ["--address", cluster.address, "--out", str(out)]
-        command += ["--steps", "5100"]  # in the second half it learns
+        command += ["--steps", "5100"]  # the last hundred learn
         environ = os.environ | {"OMP_NUM_THREADS": "1"}  # the runners need the other cores
         with subprocess.Popen(
             command, cwd=ROOT, env=environ, stdout=subprocess.PIPE, text=True
