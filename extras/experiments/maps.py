@@ -9,8 +9,8 @@ from render import Scene
 
 SCALE = 8  # px a metre
 MARGIN = 4.0  # m around the forest
-COLOURS = dict.fromkeys(("side", "back", "time"), "#e69f00")  # Okabe and Ito's palette
-COLOURS |= {"crash": "#d55e00", "goal": "#009e73", "far": "#56b4e9", "": "#0072b2"}
+COLOURS = {"": "#444444", "crash": "#d55e00", "goal": "#009e73", "far": "#0072b2"}  # by the end:
+COLOURS |= {"side": "#e69f00", "back": "#cc79a7", "time": "#56b4e9"}  # Okabe and Ito's palette
 
 
 def draw_map(trunks: ndarray, size: tuple[float, float], title: str = "") -> Image.Image:
@@ -25,7 +25,7 @@ def draw_map(trunks: ndarray, size: tuple[float, float], title: str = "") -> Ima
     draw.rectangle(corners, fill="#f2f2ea")
     for x, y in trunks:
         disc(image, x, y, Scene.trunk_radius, "#5b5b50")
-    disc(image, 0, 0, 0.8, "#0072b2")
+    disc(image, 0, 0, 0.8, "#444444")
     disc(image, length, 0, 1.6, "#009e73")
     draw.text((8, 4), title, fill="black", font_size=18)
     return image
