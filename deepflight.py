@@ -21,11 +21,11 @@ forests: return -6.7, episodes of 119 steps (random ones have 27), 21 % crossed,
 
 A seed is a forest, and there are three sets of them:
     training    [0, 10^9)
-    validation  [10^9, 2 * 10^9)    may choose the weights (best.pt)
+    validation  [10^9, 2 * 10^9)    48 of them choose the weights (best.pt)
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
 A run's folder holds config.json, log.csv, validation.jsonl (one line an episode), checkpoint.pt and
-best.pt, the weights: those of the best validation, or in the last tenth of the steps their mean.
+best.pt: the best weights in validation, or in the last tenth of the steps the mean of all weights.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -100,14 +100,14 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     one place earns as much as one that flies past it.
     goal_bonus: arrival ends the episode, and with it all rewards. To stay near the goal for ever
     would earn 1.25 + 0.99 * 1.25 + ... = 1.25 / (1 - 0.99) = 125 at most. So arrival earns as much:
-    1.25 at once, and 125 as if in the next step, where it counts 0.99 times.
+    1.25 at once, and 125 one step later, where it counts 0.99 times.
     far_bonus: the frames hardly show which edge is the far one, so a drone that leaves is not sure
-    whether it gets -10 or 188. The bonus makes this risk worth taking; 200 was found by trial. It
+    whether it gets -10 or 188. The bonus makes this risk worth it; 200 was found in validation. It
     changes the task: the paper counts the far edge as a crash, and here it is worth more than
     arrival. So look at the share that arrived too, and not only at the share that crossed.
 
-    On purpose, these parts change which way of flying is best. Potential-based ones, for any f
-    gamma * f(s2) - f(s), would not [Ng 1999]. Every printed or logged return is the paper's.
+    On purpose, these parts change which way of flying is best. Potential-based parts, which are
+    gamma * f(s2) - f(s) for any f, would not [Ng 1999]. All printed returns are the paper's.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -133,7 +133,7 @@ class Run:
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log, self.flown = c, folder, [], []
         self.rng = np.random.default_rng(c.seed)
-        self.forest_rng = np.random.default_rng([c.seed, 1])  # so exploring changes no forest
+        self.forest_rng = np.random.default_rng([c.seed, 1])  # exploring shifts no forest
         seeds = (int(self.forest_rng.integers(TRAIN_END)) for _ in count())
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)
@@ -215,7 +215,7 @@ class Run:
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state = saved["rng"]
         self.log, self.flown = saved["log"], saved["flown"]
-        if saved["config"]["steps"] != self.c.steps:  # by the new length lr rises again
+        if saved["config"]["steps"] != self.c.steps:  # over more steps lr is higher again
             self.agent.averaged.n_averaged.zero_()  # a longer training averages its own last share
 
 
@@ -225,7 +225,7 @@ def dqn_pilot(q: QNetwork) -> Pilot:
 
 
 def fly_random(seeds: Sequence[int], world: World) -> list[Episode]:
-    """The baseline: 2,000 random episodes or a few more, because they vary so much in length."""
+    """The baseline: 2,000 random episodes or more, because they vary so much in length."""
     pilot, repeats = env.random_pilot(np.random.default_rng(0)), -(-2000 // len(seeds))
     return [episode for _ in range(repeats) for episode in fly(pilot, seeds, world)]
 
@@ -235,8 +235,8 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
     q, world, name = load_weights(args.weights, config.network)
     seeds = range(args.first_seed, args.first_seed + args.episodes)
     film = args.out / f"{args.weights.stem}.gif"
-    if not (0 < args.episodes <= 10**6 and args.first_seed >= 0 and 0 < args.threads <= 64):
-        raise InputError("allowed: episodes 1 to 10^6, first-seed 0 or more, threads 1 to 64")
+    if not (0 < args.episodes <= 10**5 and args.first_seed >= 0 and 0 < args.threads <= 64):
+        raise InputError("allowed: episodes 1 to 10^5, first-seed 0 or more, threads 1 to 64")
     for path in {film, args.json or film}:  # better to fail now than after all episodes
         path.parent.mkdir(parents=True, exist_ok=True)
         path.open("ab").close()
@@ -349,7 +349,7 @@ def load(path: Path | str, *keys: str) -> dict[str, Any]:
     """Read what save wrote, without running any code from the file. InputError if it cannot be
     read, is damaged, or does not hold these keys."""
     try:
-        archive = zipfile.ZipFile(path)  # its checksums miss the flags, which torch leaves at 0
+        archive = zipfile.ZipFile(path)  # its checksums leave out the flags, 0 in torch's
         if archive.testzip() or any(part.external_attr for part in archive.infolist()):
             raise zipfile.BadZipFile
         content = torch.load(path, weights_only=True)
@@ -386,7 +386,7 @@ def stop_signals() -> Iterator[list[int]]:
     """A list that Ctrl-C and the other signals are written to, so that the running step can end.
     One that nohup ignores stays ignored."""
     stopped: list[int] = []
-    names = "SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1"  # clusters send the last one before the end
+    names = "SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1"  # clusters send SIGUSR1 before the end
     with ExitStack() as afterwards:
         for number in {getattr(signal, name, signal.SIGINT) for name in names}:
             if signal.getsignal(number) != signal.SIG_IGN:

@@ -14,7 +14,7 @@ s is r plus gamma times the return from s2, so every transition (s, a, r, s2) ma
     y = r + gamma * max over a2 of Q(s2, a2)        or y = r, if the world ended the episode
 
 In numbers: r = 0.5, and the greatest of the nine Q(s2, .) is 10. Then y = 0.5 + 0.99 * 10 = 10.4.
-If Q(s, a) is 8, its error is 2.4, and all weights are moved a little so that it grows. y is called
+If Q(s, a) is 8, the error is 2.4, and all weights move a little, so that Q(s, a) grows. y is called
 the TD target (temporal difference), and the equation is Bellman's. To make a target from another
 estimate is called bootstrapping. It works because each target holds one true reward, and where a
 crash ends an episode the whole target is true. Take three steps with rewards 0.5, 0.5 and -10, one
@@ -28,7 +28,7 @@ action only, and let all Q be 0 at first. Each update sets all three to their ta
 The truth moves backwards. Three things can go wrong, and DQN has an answer to each:
   * Steps that follow each other are alike (correlated samples), and a network that learns from them
     in that order forgets the rest. So a **replay** keeps transitions, and each update draws some at
-    random. Older, worse agents flew them, and yet they teach the best: y asks for the best action
+    random. Older, worse agents flew them, and yet they serve: y asks for the best action
     in s2 and not for the one that was taken (Q-learning is off-policy; but see `window`).
   * Each update of Q also moves the targets. So they come from a **target network** Q^, a copy of Q
     that is synced only now and then.
@@ -40,13 +40,13 @@ DQN for one environment, without what is marked [+] below:
     s = the first observation of an episode
     for each step:
         a = a random action with probability epsilon, else the a of greatest Q(s, a)
-        s2, r, end = fly(a)
+        s2, r, end = step(a)
         put s, a, r, s2, end into the replay
         s = s2, or if the episode has ended the first observation of another one
         every 4 steps:
             b = 32 random transitions of the replay
             y = b.r if b.end is TERMINAL else b.r + gamma * max Q^(b.s2, .)
-            loss = the mean of (y - Q(b.s, b.a))^2 / 2, straight lines beyond an error of 1
+            loss = the mean of (y - Q(b.s, b.a))^2 / 2, linear beyond an error of 1
             move the weights of Q a little against the gradient of the loss
         every 2,000 steps:
             Q^ = Q
@@ -202,7 +202,7 @@ class Replay:
         """Write one transition per environment: s, s2 (L, 4, 84, 84), all others (L,).
 
         The next row holds the newest frame of s2. If the time limit ends an episode, the next row
-        begins another one, but the target still needs that frame, so `last_frames` keeps it. After
+        begins another one, but the target needs s2's newest frame, so `last_frames` keeps it. After
         a crash no target needs it.
         """
         row = self.added % self.rows
@@ -234,8 +234,8 @@ class Replay:
         """
         rows, envs = (row[:, None] + np.arange(n)) % self.rows, env[:, None]  # (B, n), (B, 1)
         live = self.ends[rows, envs] == LIVE  # (B, n)
-        # reached: 1 while no earlier step has ended the episode. In the example of the class, row 1
-        # with n = 3: live 1 0 1, so reached 1 1 0, count 2, and the last row is 2.
+        # reached: 1 up to the step that ends the episode, then 0. In the example of the class, row
+        # 1 with n = 3: live 1 0 1, so reached 1 1 0, count 2, and the last row is 2.
         reached = np.ones((len(row), n), np.float32)  # (B, n)
         reached[:, 1:] = np.cumprod(live[:, :-1], 1)
         discounts = np.float32(gamma) ** np.arange(n, dtype=np.float32)  # (n,)
@@ -283,12 +283,12 @@ class Agent(nn.Module):
     Adam moves each weight by -lr * m / (sqrt(v) + eps). m = 0.9 * m + 0.1 * g is a running mean of
     its gradient g, and v of g^2, with 0.999 and 0.001 (both corrected for their start at 0). So all
     weights move about equally fast, but for those with gradients below eps. Rainbow's eps is 1.5e-4
-    [Hessel 2018]. Ours is huber_delta times that: an error may pull huber_delta times as hard.
+    [Hessel 2018]. Ours is huber_delta times that, because gradients may be that much larger.
     """
 
     def __init__(self, c: DQNConfig, actions: int, rng: Generator) -> None:
         super().__init__()
-        with torch.random.fork_rng():  # torch draws the first weights from a generator of its own
+        with torch.random.fork_rng():  # afterwards torch's generator is as it was
             torch.manual_seed(int(rng.integers(2**63)))
             self.q = QNetwork(actions).to(memory_format=torch.channels_last)  # line 2
         self.q_target = copy.deepcopy(self.q)  # line 3

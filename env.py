@@ -19,7 +19,7 @@ a new frame from its camera. Each step earns a reward, which says how good the s
     | in the air, d_obs from 2.0 to 0.75 m | r_near + r_goal                                     |
     | in a crash, d_obs < 0.75 m           | r_crash                                             |
     | outside: x < -2, x > 90, abs(y) > 25 | r_crash                                             |
-    | within 3 m of the goal, or too late  | as in the air                                       |
+    | within 3 m of the goal, out of time  | as in the air                                       |
 
     r_safe = 0.25    r_crash = -10    r_goal = 1 - d_goal / d_max, 0 at the start and 1 at the goal
     r_near = -5 * (2.0 - d_obs) / (2.0 - 0.75), 0 at d_neg = 2.0 m and -5 at d_crash = 0.75 m
@@ -34,8 +34,8 @@ only the clock ends it, after 1,000 steps: the drone was still flying, and more 
 followed. A learner must keep the two apart, or it takes the clock for a crash.
 
 The drone sees its last four frames, an **observation**. That is less than the whole state of the
-world: the frames hardly show which edge of the forest is the far one, and not what stands behind
-the next trunk. The world is partially observed.
+world: the frames hardly show which edge of the forest is the far one, and never what stands behind
+a trunk. The world is partially observed.
 
 pymunk, a physics library, moves the drone and measures d_obs. An episode is a deterministic
 function of its seed and its actions, so these two are all it takes to fly it again.
@@ -44,8 +44,8 @@ Legend
     d_obs     m, from the drone's centre to the nearest trunk's surface, at most a laser's range
     d_goal    m, from the drone's centre to the goal
     d_max     m, the forest's length
-    psi, N    the heading in rad, trunks
-    E         active drones: those whose episodes have not ended
+    psi       the heading in rad
+    N, E      trunks; active drones, which are those whose episodes have not ended
     [DF]      the Deep Flight paper; "authors' simulator" is the code released with it
     ours      a number that neither gives
 
@@ -92,7 +92,7 @@ class World(Scene):
 
 
 def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
-    """The reward of one step, [DF §II-A] line by line.
+    """The reward of one step [DF §II-A].
 
     outcome: "" in the air, else one of OUTCOMES. d_obs, d_goal: m. We correct two slips: the paper
     has r_near's inequality reversed, and the authors' simulator forgets to add r_goal.
@@ -155,7 +155,7 @@ class Drone:
             raise ValueError(f"no action {action}, or the episode is over: {self.outcome!r}")
         self.actions.append(int(action))
         yaw_rate = world.yaw_rate * (2 * action / (world.num_actions - 1) - 1)  # rad/s
-        heading = self.body.angle + yaw_rate * world.dt  # rad: turn first, then fly
+        heading = self.body.angle + yaw_rate * world.dt  # rad, after this turn
         self.body.velocity = world.speed * math.cos(heading), world.speed * math.sin(heading)
         self.body.angular_velocity = yaw_rate
         self.space.step(world.dt)  # pymunk moves the drone for dt seconds
@@ -213,7 +213,7 @@ class VecForest:
         return [drone for drone in self.drones if not drone.outcome]
 
     def reset_done(self) -> ndarray:
-        """Begin an episode where none is active; returns all observations (E, 4, 84, 84) uint8."""
+        """Reset the drones whose episodes have ended; returns all observations (E, 4, 84, 84)."""
         for drone in self.drones:
             if drone.outcome and (seed := next(self.seeds, None)) is not None:
                 drone.reset(seed)

@@ -35,7 +35,7 @@ A pinhole camera has two rules:
   * Column i looks along tan(bearing) = (41.5 - i) / 42, positive to the left. The columns are
     equally spaced on the image plane, and not in angle.
   * Row i, at depth z, looks at a point (41.5 - i) / 42 * z metres above the camera. Depth is
-    measured along the optical axis. With distance along the ray, straight edges would look bent.
+    the distance straight ahead. With distance along the ray, a wall's straight top would look bent.
 The trunk of the example is 9.6 m away. Its top is 4 m higher than the camera, its foot 2 m lower,
 so it fills the rows from 41.5 - 42 * 4 / 9.6 = 24.0 to 41.5 + 42 * 2 / 9.6 = 50.25.
 
@@ -46,7 +46,7 @@ different [DF §IV].
 Legend
     N, M  trunks, rays
     grey  0 is black, 255 is white
-    [DF]  the Deep Flight paper; "authors' simulator": its code; "ours": a number of neither
+    [DF]  the Deep Flight paper; "authors' simulator": its code; "ours": a number from neither
 
 Not in this file: textures, shadows, leaning trunks, a drone that climbs.
 """
@@ -104,11 +104,11 @@ def raycast(centres: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray
     cos, sin = np.cos(bearings), np.sin(bearings)  # (M,), (M,)
     along = centres @ np.array([cos, sin])  # (N, M) m: x * cos + y * sin
     across = centres @ np.array([-sin, cos])  # (N, M) m: y * cos - x * sin
-    hit = (along > 0) & (np.abs(across) < radius)  # (N, M) the others are beside, or behind
+    hit = (along > 0) & (np.abs(across) < radius)  # (N, M) neither behind nor beside
     half_chord = np.sqrt(np.where(hit, radius**2 - across**2, 0.0))  # (N, M) m
     distance = np.where(hit, along - half_chord, np.inf)  # (N, M) m
     nearest = distance.min(0, initial=np.inf)  # (M,) m
-    half_chord[distance > nearest] = 0.0  # only that of the nearest trunk is left
+    half_chord[distance > nearest] = 0.0  # all but the nearest trunk's, which max takes
     return nearest, half_chord.max(0, initial=0.0) / radius
 
 
@@ -147,7 +147,7 @@ def paint(frame: ndarray, depth: ndarray, height: float, value: ndarray, scene: 
 def draw_frame(pose: Sequence[float], trunks: ndarray, scene: Scene) -> ndarray:
     """What a drone sees: a frame (84, 84) uint8. pose: x, y in m, heading in rad. trunks (N, 2): m.
 
-    Like a painter it draws what is far first, and what is near over it.
+    Like a painter it draws the background, then the pole over it, then the trunks before the pole.
     """
     frame, seen = background(scene), seen_from(pose, trunks)  # (84, 1), (N, 2) m
     ahead, left = seen.T  # (N,), (N,) m
