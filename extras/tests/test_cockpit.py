@@ -201,8 +201,9 @@ def root(tmp_path: Path) -> Path:
     """A training with the default settings, beside committed ones, and foreign folders."""
     some = network_episodes()
     keep_training(tmp_path / "runs/mine", {5_000: some[:6], 10_000: some[6:12]}, seed=7, threads=2)
+    logs = shutil.ignore_patterns("*.jsonl")
     for name in ("dqn", "dqn-1", "dqn-2", "dqn-beacon"):
-        shutil.copytree(ROOT / "results" / name, tmp_path / "results" / name)
+        shutil.copytree(ROOT / "results" / name, tmp_path / "results" / name, ignore=logs)
     (tmp_path / "weights").mkdir()
     save_weights(tmp_path / "weights/dqn-9.pt", QNetwork(9), Config(beacon=True))
     return tmp_path
