@@ -37,7 +37,9 @@ LESSONS = {f"DQN, seed {seed}": (name, "dqn") for seed, name in enumerate(SEEDS)
     "PQN, seed 0": ("pqn", "pqn"), "PQN, seed 1": ("pqn-1", "pqn"),
     "PQN, seed 2": ("pqn-2", "pqn"), "memory, seed 0": ("memory", "memory"),
     "memory, seed 1": ("memory-1", "memory"), "DRQN, seed 0": ("drqn", "drqn"),
-    "DRQN, seed 1": ("drqn-1", "drqn"), "the planner": ("imitation", "laser"),
+    "DRQN, seed 1": ("drqn-1", "drqn"), "place, seed 0": ("place", "place"),
+    "place, seed 1": ("place-1", "place"), "place and beacon, seed 0": ("place-beacon", "place"),
+    "the planner": ("imitation", "laser"),
 }  # fmt: skip
 
 
