@@ -21,11 +21,11 @@ forests: return -6.7, episodes of 119 steps (random ones have 27), 21 % crossed,
 
 A seed is a forest, and there are three sets of them:
     training    [0, 10^9)
-    validation  [10^9, 2 * 10^9)    48 of them choose the weights (best.pt)
+    validation  [10^9, 2 * 10^9)    48 of them may choose the weights (best.pt)
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
 A run's folder holds config.json, log.csv, validation.jsonl (one line an episode), checkpoint.pt and
-best.pt: the best weights in validation, or in the last tenth of the steps the mean of all weights.
+best.pt: the best weights in validation; in the last tenth of the steps, their mean over that tenth.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -106,8 +106,8 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     changes the task: the paper counts the far edge as a crash, and here it is worth more than
     arrival. So look at the share that arrived too, and not only at the share that crossed.
 
-    On purpose, these parts change which way of flying is best. Potential-based parts, which are
-    gamma * f(s2) - f(s) for any f, would not [Ng 1999]. All printed returns are the paper's.
+    On purpose, these parts change which way of flying is best. Potential-based ones, gamma * f(s2)
+    - f(s), cancel along a flight, so they would not [Ng 1999]. All printed returns are the paper's.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -133,7 +133,7 @@ class Run:
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log, self.flown = c, folder, [], []
         self.rng = np.random.default_rng(c.seed)
-        self.forest_rng = np.random.default_rng([c.seed, 1])  # exploring shifts no forest
+        self.forest_rng = np.random.default_rng([c.seed, 1])  # its own: exploring shifts no forest
         seeds = (int(self.forest_rng.integers(TRAIN_END)) for _ in count())
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)
@@ -209,13 +209,13 @@ class Run:
             s2, r, terminated, truncated, drones = self.envs.step(actions)
             r = shaped_reward(r, drones, self.c)  # (L,)
             self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
-        if self.forest_rng.bit_generator.state != saved["forests"]:  # not as many have begun
+        if self.forest_rng.bit_generator.state != saved["forests"]:  # fewer or more have begun
             raise InputError(f"{self.folder}: its actions lead to other episodes on this machine")
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state = saved["rng"]
         self.log, self.flown = saved["log"], saved["flown"]
-        if saved["config"]["steps"] != self.c.steps:  # over more steps lr is higher again
+        if saved["config"]["steps"] != self.c.steps:  # more steps: the last tenth begins later
             self.agent.averaged.n_averaged.zero_()  # a longer training averages its own last share
 
 

@@ -51,9 +51,9 @@ DQN for one environment, without what is marked [+] below:
         every 2,000 steps:
             Q^ = Q
 
-Legend: A actions, B transitions in a batch, L environments side by side (all E are active in
-training), T rows of the replay. A pass is one control step of all environments. [+name] marks what
-[Mnih15] does not have; the setting of that name switches it off. Three more are always on: Adam,
+Legend: A actions, B transitions in a batch, L environments side by side (E = L in training), T
+rows of the replay. A pass is one control step of all environments. [+name] marks what [Mnih15] does
+not have; the setting of that name switches it off. Three more are always on: Adam,
 bfloat16 where the processor knows it, and rewards that are not clipped to -1 .. 1.
 """
 

@@ -19,7 +19,7 @@ a new frame from its camera. Each step earns a reward, which says how good the s
     | in the air, d_obs from 2.0 to 0.75 m | r_near + r_goal                                     |
     | in a crash, d_obs < 0.75 m           | r_crash                                             |
     | outside: x < -2, x > 90, abs(y) > 25 | r_crash                                             |
-    | within 3 m of the goal, out of time  | as in the air                                       |
+    | within 3 m of goal, or out of time   | as in the air                                       |
 
     r_safe = 0.25    r_crash = -10    r_goal = 1 - d_goal / d_max, 0 at the start and 1 at the goal
     r_near = -5 * (2.0 - d_obs) / (2.0 - 0.75), 0 at d_neg = 2.0 m and -5 at d_crash = 0.75 m
@@ -223,7 +223,7 @@ class VecForest:
         """One control step of the active drones; actions: one for each, in order.
 
         Returns the new observations (E, 4, 84, 84), rewards (E,), terminated (E,), truncated (E,),
-        and these drones, because `active` has lost those that ended.
+        and the drones that flew, because `active` lacks those that just ended.
         """
         drones = self.active
         r = np.array([drone.step(a) for drone, a in zip(drones, actions, strict=True)])  # (E,)

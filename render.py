@@ -39,9 +39,9 @@ A pinhole camera has two rules:
 The trunk of the example is 9.6 m away. Its top is 4 m higher than the camera, its foot 2 m lower,
 so it fills the rows from 41.5 - 42 * 4 / 9.6 = 24.0 to 41.5 + 42 * 2 / 9.6 = 50.25.
 
-The disparity camera draws the same outlines, but a pixel says how near its point is, whatever paint
-and light do. So a pilot that learns from disparity in one forest should fly in forests that look
-different [DF §IV].
+The disparity camera draws the same outlines, but a pixel says how near its point is, whatever its
+colour and the light. So a pilot that learns from disparity in one forest should fly in forests that
+look different [DF §IV].
 
 Legend
     N, M  trunks, rays
@@ -108,7 +108,7 @@ def raycast(centres: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray
     half_chord = np.sqrt(np.where(hit, radius**2 - across**2, 0.0))  # (N, M) m
     distance = np.where(hit, along - half_chord, np.inf)  # (N, M) m
     nearest = distance.min(0, initial=np.inf)  # (M,) m
-    half_chord[distance > nearest] = 0.0  # all but the nearest trunk's, which max takes
+    half_chord[distance > nearest] = 0.0  # keep the nearest trunk's: max finds it
     return nearest, half_chord.max(0, initial=0.0) / radius
 
 
