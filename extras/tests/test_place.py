@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from env import VecForest, World
-from extras.lessons.expert import consult
+from extras.lessons.expert import consult, plan
 from extras.lessons.memory import QNetwork
 from extras.lessons.place import PlaceConfig, PlaceReplay, mirror
 from extras.tests.test_expert import assert_same_training, finish, little_to_fly
@@ -28,6 +28,13 @@ def flown(steps: int) -> tuple[PlaceReplay, list[list[float]]]:
         s2, r, terminated, truncated, _ = envs.step(a := rng.integers(9, size=1))
         replay.add(s, a, r, s2, terminated, truncated)
     return replay, poses
+
+
+def test_the_header_tells_what_the_planner_says_of_two_edges() -> None:
+    bearings, nothing = np.arange(360) * (2 * np.pi / 360), np.full(360, World.laser_range)
+    for pose, straight, right in (((82, 15, 0), 112.3, 112.5), ((40, 17, np.pi / 2), 4.0, 58.4)):
+        scores = plan(bearings, nothing, pose, World(), PlaceConfig())
+        assert [round(scores[4], 1), round(scores[0], 1)] == [straight, right]
 
 
 def test_a_drawn_transition_comes_with_the_pose_in_which_its_frames_were_seen() -> None:
