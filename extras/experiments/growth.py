@@ -23,7 +23,6 @@ ROOT = Path(__file__).parents[2]
 SHARES = 0.025, 0.075, 0.25, 1.0  # of the training's length, at which the four moments are
 ENDS = {"": "in the air", "crash": "hit a trunk", "goal": "arrived", "time": "out of time"}
 ENDS |= {side: f"left by the {side} edge" for side in ("far", "side", "back")}
-NEAREST = Image.Resampling.NEAREST
 
 
 def read(folder: Path) -> tuple[World, dict[str, list[Episode]]]:
@@ -82,7 +81,7 @@ def moment(drone: Drone, way: np.ndarray, title: str, world: World) -> Image.Ima
     """A panel of the film: the drone's newest frame, and its way so far."""
     plain = draw_map(drone.trunks, (world.length, world.width))
     picture = Image.new("RGB", (480, 168), "white")
-    picture.paste(Image.fromarray(drone.observation[-1]).resize((168, 168), NEAREST))
+    picture.paste(Image.fromarray(drone.observation[-1]).resize((168, 168), 0))  # not smoothed
     picture.paste(draw_ways(plain, [(way, drone.outcome, "")]).resize((304, 168)), (176, 0))
     return headed(picture, f"{title}: {ENDS[drone.outcome]}")
 
@@ -104,9 +103,7 @@ def film(flown: dict[str, Episode], world: World) -> list[Image.Image]:
 def main(folder: Path, out: Path) -> None:
     """Draw the picture and the film of a training."""
     world, kept = read(folder)
-    sheet([all_ways(title, episodes, world) for title, episodes in kept.items()]).save(
-        out / "growth.png"
-    )
+    sheet([all_ways(*one, world) for one in kept.items()]).save(out / "growth.png")
     *_, last = kept.values()
     shown = next((i for i, e in enumerate(last) if e["outcome"] in ("goal", "far")), 0)
     first, *rest = film({title: episodes[shown] for title, episodes in kept.items()}, world)
