@@ -2,6 +2,7 @@
 
     .venv/bin/python -m extras.cockpit              # then open the address that it prints
     .venv/bin/python -m extras.cockpit --port N     # at another port
+    .venv/bin/python DIR/extras/cockpit             # from any directory
 
 A web page on this machine, for this machine. It needs no package but the core's. episodes.py has
 the answers; index.html, cockpit.js, learning.js and cockpit.css are the page.
@@ -102,6 +103,7 @@ class Handler(BaseHTTPRequestHandler):
 def main(argv: list[str] | None = None) -> int:
     """Serve until Ctrl-C. Returns the exit code: 130, as a shell expects then; 2 for bad input."""
     try:  # the imports too, because torch takes seconds
+        sys.path.insert(0, str(Path(__file__).parents[2]))  # where a script's own imports are
         from extras.cockpit.episodes import Hangar
 
         parser = argparse.ArgumentParser(prog="extras.cockpit", usage=argparse.SUPPRESS)

@@ -412,3 +412,10 @@ def test_bad_input_is_a_line(server: Server) -> None:
         process = cockpit(*flags)
         output, error = process.communicate()
         assert (process.returncode, output, error.count("\n")) == (2, "", 1), error
+
+
+def test_it_starts_as_a_script_from_any_directory(tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "extras/cockpit"), "--port", "70000"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("extras.cockpit: port 70000")
