@@ -574,9 +574,9 @@ def flown() -> dict[int, list[Episode]]:
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shipped network, the logs of three committed trainings, and room for runs."""
-    root = tmp_path_factory.mktemp("root")
+    root, logs = tmp_path_factory.mktemp("root"), shutil.ignore_patterns("*.jsonl")
     for name in ("dqn", "dqn-1", "dqn-2"):
-        shutil.copytree(ROOT / "results" / name, root / "results" / name)
+        shutil.copytree(ROOT / "results" / name, root / "results" / name, ignore=logs)
     (root / "weights").mkdir()
     shutil.copy(ROOT / "weights/dqn.pt", root / "weights")
     return root
