@@ -258,6 +258,7 @@ def test_a_signal_saves_the_weights_so_far(name: str, tmp_path: Path) -> None:
 
 def test_a_second_signal_does_not_end_what_follows_the_first() -> None:
     before = signal.getsignal(signal.SIGTERM)
+    hears = signal.signal(signal.SIGINT, signal.default_int_handler)  # nohup may ignore it
     with ended_by_signals() as stopped:
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGUSR1)
@@ -265,6 +266,7 @@ def test_a_second_signal_does_not_end_what_follows_the_first() -> None:
             signal.raise_signal(number)
     assert stopped == [signal.SIGUSR1, signal.SIGTERM, signal.SIGINT, signal.SIGUSR1]
     assert signal.getsignal(signal.SIGTERM) == before
+    signal.signal(signal.SIGINT, hears)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
         with ended_by_signals() as stopped:
