@@ -90,10 +90,11 @@ def film(flown: dict[str, Episode], world: World) -> list[Image.Image]:
     """The pictures of the film; each episode holds its last one until the longest has ended."""
     panels = []
     for title, episode in flown.items():
-        way, pictures = path(episode, world), []
+        way, pictures = [], []
         for t, drone in enumerate(refly(episode, world)):
+            way.append(drone.pose[:2])
             if t % 2 == 0 or drone.outcome:
-                pictures.append(moment(drone, way[: t + 1], title, world))
+                pictures.append(moment(drone, np.array(way), title, world))
         panels.append(pictures)
     longest = max(map(len, panels)) + 15
     shown = ([panel[min(t, len(panel) - 1)] for panel in panels] for t in range(longest))
