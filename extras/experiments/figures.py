@@ -22,15 +22,16 @@ from matplotlib.figure import Figure
 
 from deepflight import load_weights, measure, save_film
 from env import World, plant
+from extras.experiments.maps import SEEDS
 from extras.lessons import looks
 
 ROOT = Path(__file__).parents[2]
 PAPER = 1.8  # the paper's figure: 180 % more flight time than random [DF, abstract]
 PANELS = {  # column of log.csv -> title, factor
-    "train_return": ("Return in training, mean of 100 episodes (the paper's Figure 2)", 1),
-    "validation_return": ("Return in validation (Figure 3)", 1),
-    "validation_steps": ("Steps of an episode in validation (Figure 4)", 1),
-    "validation_crossed": ("Crossed in validation, %", 100),
+    "train_return": ("Return in training, with random actions: mean of 100 episodes", 1),
+    "validation_return": ("Return in validation: mean of 48 episodes", 1),
+    "validation_steps": ("Steps of an episode in validation", 1),
+    "validation_crossed": ("Crossed the forest in validation, %", 100),
 }
 
 
@@ -38,9 +39,9 @@ def levels(axes: plt.Axes, column: str, factor: float, report: dict) -> None:
     """The random pilot, and the paper's 180 % above it."""
     baseline = factor * report["pilots"]["random"][column.split("_")[1]]["value"]
     if column == "validation_steps":
-        level = (1 + PAPER) * baseline
-        axes.axhline(level, color="black", linestyle="--", label="the paper: +180 %")
-    axes.axhline(baseline, color="black", linestyle=":", label="random pilot")
+        label = f"the paper: {PAPER:.0%} longer than random"
+        axes.axhline((1 + PAPER) * baseline, color="black", linestyle="--", label=label)
+    axes.axhline(baseline, color="black", linestyle=":", label="random actions")
 
 
 def finish(figure: Figure, name: str) -> None:
@@ -58,7 +59,7 @@ def draw_learning(report: dict) -> None:
     for axes, (column, (title, factor)) in zip(panels.flat, PANELS.items(), strict=True):
         for seed, folder in enumerate(("dqn", "dqn-1", "dqn-2")):
             log = np.genfromtxt(ROOT / f"results/{folder}/log.csv", delimiter=",", names=True)
-            axes.plot(log["step"], factor * log[column], f"C{seed}", label=f"DQN, seed {seed}")
+            axes.plot(log["step"], factor * log[column], SEEDS[seed], label=f"DQN, seed {seed}")
         levels(axes, column, factor, report)
         axes.set_title(title, fontsize=11)
     for axes in panels[1]:
@@ -71,15 +72,19 @@ def draw_looks() -> None:
     """Five tiles a row: what the network sees, and how many of its episodes cross."""
     report = json.loads(looks.RESULT.read_text())
     tiles = [(camera, *item) for camera, flown in looks.LOOKS.items() for item in flown.items()]
-    figure, panels = plt.subplots(-(-len(tiles) // 5), 5, figsize=(8.7, 8.5), layout="constrained")
+    figure, panels = plt.subplots(-(-len(tiles) // 5), 5, figsize=(8.7, 9.1), layout="constrained")
     pose, trunks = (43.0, -12.85, 0.19), plant(looks.FORESTS[0], World())
     for axes, (camera, name, look) in zip(panels.flat, tiles, strict=False):
         pilots = [report[pilot][name] for pilot in report if pilot.startswith(camera)]
         shares = " / ".join(f"{100 * pilot['crossed']['value']:.0f}" for pilot in pilots)
         frame = looks.wear(look, pose, trunks, World(camera=camera))
         axes.imshow(frame, "gray", vmin=0, vmax=255)
-        axes.set_title(f"{camera}: {name}\ncrossed {shares} %", fontsize=9)
+        axes.set_title(f"{camera}: {name}\ncrossed {shares} %", fontsize=10)
         axes.axis("off")
+    text = "What the network sees, and the share of flights that cross: of the pilot that\n"
+    figure.suptitle(
+        text + "trained with the plain look / of the one that trained with random looks"
+    )
     finish(figure, "transfer.png")
 
 

@@ -11,8 +11,7 @@ controls: rung 7 with another loss or learning rate, and with two seeds, rung 7 
 that do not stand out. What has been flown is not trained again. `fly` flies two networks of each
 through 200 forests: what best.pt keeps, and the newest, which it writes to last.pt. It adds them to
 results/ladder.json, and copies logs and settings to results/. `draw` draws figures/ladder.png: a
-row a rung, a colour a seed, with 95 % intervals over the forests; a dot is best.pt, and a ring the
-newest network.
+row a rung, with 95 % intervals over the forests.
 """
 
 import json
@@ -32,6 +31,7 @@ import matplotlib.pyplot as plt
 from deepflight import Config, dqn_pilot, fly_random, load, load_weights, save_weights, summarize
 from dqn import QNetwork
 from env import Episode, World, fly
+from extras.experiments.maps import SEEDS as COLOURS
 
 ROOT = Path(__file__).parents[2]
 STEPS, SEEDS = 100_000, (0, 1)
@@ -41,6 +41,7 @@ PANELS = {  # metric -> title, factor
     "return": ("return by the paper's reward", 1),
     "crossed": ("crossed, %", 100),
 }
+NETWORKS = {"best": "best.pt", "last": "newest weights"}
 FORESTS = range(4 * 10**9, 4 * 10**9 + 200)  # no training uses them, and nothing is chosen by them
 RECIPE, MNIH = ("deepflight.py",), ("-m", "extras.lessons.mnih")  # programs that train
 
@@ -187,19 +188,25 @@ def draw() -> None:
     """Three panels, a row a rung, its seeds one above the other."""
     report = flown()
     rungs = sorted(label for label in report if label not in CONTROLS)
-    figure, axes = plt.subplots(1, 3, figsize=(12, 4.5), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(10, 5), sharey=True, layout="constrained")
     for panel, (key, (title, factor)) in zip(axes, PANELS.items(), strict=True):
         dots = ((row, x) for row, label in enumerate(rungs) for x in report[label].items())
         for row, (seed, found) in dots:
-            for which, face, shift in (("best", f"C{seed}", 0.0), ("last", "white", 0.12)):
+            colour = COLOURS[int(seed)]
+            for which, face, shift in (("best", colour, 0.0), ("last", "white", 0.12)):
                 value, low, high = (factor * found[which][key][x] for x in INTERVAL)
                 y = row + 0.26 * int(seed) - 0.19 + shift
-                panel.plot([low, high], [y, y], f"C{seed}", linewidth=1)
-                panel.plot(value, y, "o", color=f"C{seed}", markerfacecolor=face, markersize=5)
+                panel.plot([low, high], [y, y], colour, linewidth=1)
+                label = f"seed {seed}, {NETWORKS[which]}"
+                panel.plot(value, y, "o", color=colour, mfc=face, markersize=5, label=label)
         panel.set_title(title, fontsize=11)
         panel.grid(alpha=0.3)
     axes[0].set_yticks(range(len(rungs)), rungs)
     axes[0].invert_yaxis()
+    handles, labels = axes[0].get_legend_handles_labels()
+    legend = dict(zip(labels, handles, strict=True))  # one entry a label
+    names = sorted(legend)
+    figure.legend([legend[x] for x in names], names, ncols=3, loc="outside lower center")
     figure.savefig(ROOT / "figures/ladder.png", dpi=100)
     print("wrote figures/ladder.png")
 

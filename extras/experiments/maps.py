@@ -11,6 +11,7 @@ SCALE = 8  # px a metre
 MARGIN = 4.0  # m around the forest
 COLOURS = {"": "#444444", "crash": "#d55e00", "goal": "#009e73", "far": "#0072b2"}  # by the end:
 COLOURS |= {"side": "#e69f00", "back": "#cc79a7", "time": "#56b4e9"}  # Okabe and Ito's palette
+SEEDS = ("#0072b2", "#e69f00", "#009e73")  # of the same palette
 
 
 def draw_map(trunks: ndarray, size: tuple[float, float], title: str = "") -> Image.Image:
