@@ -7,9 +7,9 @@ import pytest
 
 from extras.lessons.exercises import RESULT, TEXT, prepare, read, table
 
-ANSWERS = [str(number) for number in range(11)]
+ANSWERS = [str(number) for number in range(13)]
 CHANGED = {"4": "env", "5": "env", "6": "dqn", "7": "dqn", "8": "env", "9": "env"}
-CHANGED |= {"10": "deepflight"}
+CHANGED |= {"10": "deepflight", "11": "env", "12": "dqn env"}
 
 
 @pytest.mark.parametrize("number", ANSWERS)
