@@ -51,8 +51,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
-import torch
+try:
+    import numpy as np
+    import torch
+except ModuleNotFoundError as error:
+    sys.exit(f"deepflight.py: {error}; set up .venv as README.md says, and use its Python")
 from numpy import ndarray
 
 import dqn
@@ -69,7 +72,7 @@ VALIDATION = range(10**9, 10**9 + 48)
 class Config(dqn.DQNConfig):
     """All settings; each is a flag of `train`. [+] as in dqn.py: not in [Mnih15]."""
 
-    seed: int = setting(0, "of everything random", 0, 10**18)
+    seed: int = setting(0, "of everything random", 0, 10**15)
     beacon: bool = setting(False, "[+] put a visible pole at the goal", 0, 1)
     camera: str = setting("grey", "what a pixel says", *render.CAMERAS)
     threads: int = setting(1, "of the CPU; another number changes the last digits", 1, 64)
@@ -249,8 +252,7 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
     metrics = {who: summarize(flown[who], flown["random"], len(seeds)) for who in flown}
     print_table(metrics)
     if args.json:
-        report = {"weights": args.weights.name, "beacon": world.beacon, "camera": world.camera}
-        report |= {"forests": len(seeds), "first_seed": seeds[0]}
+        report = {"weights": args.weights.name, "forests": len(seeds), "first_seed": seeds[0]}
         report["pilots"] = {who: metrics[who] | {"episodes": flown[who]} for who in flown}
         save(args.json, json.dumps(report).encode())
     shown = flown[name][measure(flown[name])["crossed"].argmax()]  # the first True, or the first
@@ -317,18 +319,17 @@ def print_table(metrics: dict[str, dict]) -> None:
 
 def save_film(path: Path, episode: Episode, world: World, q: QNetwork, name: str) -> None:
     """Write an endless GIF of an episode: frame, path, and what the network says of each action."""
-    places, pictures = [], []
+    places, images = [], []
     for t, drone in enumerate(env.refly(episode, world)):
         places.append(drone.pose[:2])
         values = q.values(drone.observation[None], [drone])[0]  # (A,)
         text = f"{name}: {t * world.dt:.1f} s, {drone.d_goal:.1f} m to the goal\n"
         text += f"reward so far {drone.episode_return:.1f}   {drone.outcome}"
-        pictures.append(render.draw_panel(drone, np.array(places), values, text))
-    ms = round(1000 * world.dt)
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=ms, loop=0)
+        images.append(render.draw_panel(drone, np.array(places), values, text))
+    images[0].save(path, save_all=True, append_images=images[1:], duration=1000 * world.dt, loop=0)
 
 
-# -------------------------------------------------- files, signals: skip on a first reading
+# ---------------------------- files, signals, the command line: skip on a first reading
 
 
 def save(path: Path, content: bytes | dict[str, Any]) -> None:
@@ -395,28 +396,28 @@ def stop_signals() -> Iterator[list[int]]:
         yield stopped
 
 
-# -------------------------------------------------- the command line: skip on a first reading
-
-
 def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespace:
     """Read the command line; every setting is a flag of `train`."""
-    silent = {"prog": "deepflight.py", "usage": argparse.SUPPRESS}  # so an error is a single line
-    parser = argparse.ArgumentParser(**silent)
+    common = {"prog": "deepflight.py", "usage": argparse.SUPPRESS}  # so an error is a single line
+    common["formatter_class"] = lambda prog: argparse.RawTextHelpFormatter(prog, 2, 26)
+    common["description"] = __doc__.split("\n\n")[1]
+    parser = argparse.ArgumentParser(**common)
     commands = parser.add_subparsers(dest="command", required=True, metavar="train or eval")
-    sub = commands.add_parser("train", help="train a pilot", **silent)
+    sub = commands.add_parser("train", help="train a pilot", **common)
     sub.add_argument("--name", default="", help="of the folder in runs/; default: a number")
     sub.add_argument("--resume", type=Path, help="folder of a training to go on with")
+    group = sub.add_argument_group("settings; [+] marks what [Mnih15] does not have")
     for f in fields(config):
-        more = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type}
+        more = {"type": float if f.type is int else f.type, "metavar": ""}  # 1e6 steps are allowed
         more |= {"choices": f.metadata["legal"] or None} if f.type is str else {}
+        more = {"action": argparse.BooleanOptionalAction} if f.type is bool else more
         text = f"{f.metadata['help']} (default: {f.default})"
-        sub.add_argument("--" + f.name.replace("_", "-"), help=text, **more)
-    sub = commands.add_parser("eval", help="fly trained weights beside other pilots", **silent)
+        group.add_argument("--" + f.name.replace("_", "-"), help=text, **more)
+    sub = commands.add_parser("eval", help="fly trained weights beside other pilots", **common)
     shipped = Path(__file__).parent / "weights/dqn.pt"
-    text = "a file, or the folder of a training (default: %(default)s)"
-    sub.add_argument("--weights", type=Path, default=shipped, help=text)
-    sub.add_argument("--episodes", type=int, default=100, help="default: %(default)s")
-    sub.add_argument("--first-seed", type=int, default=TEST_FIRST, help="default: %(default)s")
+    sub.add_argument("--weights", type=Path, default=shipped, help="a file, or a run's folder")
+    sub.add_argument("--episodes", type=int, default=100, help="one a forest (default: 100)")
+    sub.add_argument("--first-seed", type=int, default=TEST_FIRST, help="(default: %(default)s)")
     sub.add_argument("--json", type=Path, help="write every metric and episode to this file")
     sub.add_argument("--out", type=Path, default="runs/eval", help="folder of the film")
     sub.add_argument("--threads", type=int, default=Config.threads, help="of the CPU")
@@ -425,7 +426,7 @@ def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespac
 
 def make_run(args: argparse.Namespace, config: type[Config]) -> Run:
     """A new training, or one to go on with."""
-    given = {f.name: x for f in fields(config) if (x := getattr(args, f.name)) is not None}
+    given = {f.name: f.type(x) for f in fields(config) if (x := getattr(args, f.name)) is not None}
     if not args.resume:
         free = (f"{i:03d}" for i in count(1) if not Path(f"runs/{i:03d}").exists())
         folder = Path("runs", args.name or next(free))

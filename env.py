@@ -46,8 +46,7 @@ Legend
     d_max     m, the forest's length
     psi       the heading in rad
     N, E      trunks; active drones, which are those whose episodes have not ended
-    [DF]      the Deep Flight paper; "authors' simulator" is the code released with it
-    ours      a number that neither gives
+    [DF]      the paper; "authors' simulator": the code released with it; "ours": from neither
 
 Not in this file: rotors, wind, inertia, a change of altitude.
 """

@@ -164,6 +164,25 @@ def test_a_bad_command_line_gets_one_line_and_exit_code_2(capsys: CaptureFixture
         assert (code, out, error.count("\n"), error[:13]) == (2, "", 1, "deepflight.py"), line
 
 
+@pytest.mark.parametrize("line", ["-h", "train -h", "eval -h"])
+def test_help_shows_the_commands_and_a_row_per_flag(line: str, capsys: CaptureFixture) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(line.split())
+    out = capsys.readouterr().out
+    assert "python deepflight.py train --resume DIR     go on with" in out
+    settings = [f for f in fields(Config) if line == "train -h"]
+    rows = [row for row in out.splitlines() if "(default: " in row and row[:4] == "  --"]
+    assert len(rows) >= len(settings)
+    for f, row in zip(settings, rows, strict=False):
+        assert f.name.replace("_", "-") in row and f"{f.metadata['help']} (def" in row
+
+
+def test_without_torch_one_line_says_what_to_do() -> None:
+    script = "import sys; sys.modules['torch'] = None; import deepflight"
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1) and "README.md" in done.stderr
+
+
 @pytest.mark.usefixtures("here")
 def test_eval_prints_a_table_and_writes_json_and_a_film(
     monkeypatch: MonkeyPatch, capsys: CaptureFixture
@@ -193,7 +212,7 @@ del signal.SIGHUP, signal.SIGPIPE
 import deepflight as d
 d.VALIDATION = range(10**9, 10**9 + 2)
 d.fly_random = lambda seeds, world: d.fly(d.env.straight_pilot, seeds, world)
-assert d.main("train --steps 80 --learning-starts 80".split()) == 0
+assert d.main("train --steps 8e1 --learning-starts 80".split()) == 0
 assert d.main("eval --episodes 1 --weights runs/001".split()) == 0
 """
 
@@ -205,4 +224,5 @@ def test_under_a_profiler_and_without_what_windows_lacks_train_and_eval_work(her
     done = subprocess.run(words, env=path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "flying straight\nflying dqn\n")
     assert (here / "runs/eval/001.gif").stat().st_size > 1000
+    assert '"steps": 80,' in (here / "runs/001/config.json").read_text()
     assert {"train", "evaluate"} <= {name for _, _, name in pstats.Stats("profile").stats}

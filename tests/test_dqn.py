@@ -2,9 +2,11 @@
 
 import inspect
 import re
+import resource
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -56,6 +58,17 @@ def naive(history: list[tuple], t: int, n: int, gamma: float) -> tuple:
             break
     s2 = {LIVE: stack(t + k + 1), TERMINAL: None, TRUNCATED: [*stack(t + k)[1:], 30_000 + frame]}
     return stack(t), history[t][1], r, s2[end], gamma ** (k + 1), end
+
+
+STATM = Path("/proc/self/statm")  # sizes in pages: of the whole process, then in memory
+
+
+@pytest.mark.skipif(not STATM.exists(), reason="needs Linux")
+def test_the_replay_takes_its_memory_at_once_and_not_hours_later() -> None:
+    before = int(STATM.read_text().split()[1])
+    replay = Replay(20_000, 8)
+    taken = (int(STATM.read_text().split()[1]) - before) * resource.getpagesize()
+    assert taken > 0.9 * replay.frames.nbytes
 
 
 @pytest.mark.parametrize("n", [1, 3, 5])
