@@ -1,4 +1,4 @@
-"""The cockpit: fly a drone, see what the network thinks, ask it why, and watch it learn.
+"""The cockpit: fly a drone, see what the network thinks, look inside, ask why, watch it learn.
 
     .venv/bin/python -m extras.cockpit              # then open the address that it prints
     .venv/bin/python -m extras.cockpit --port N     # at another port
@@ -38,7 +38,8 @@ class Server(ThreadingHTTPServer):
         # Browsers leave port 80 out.
         self.lock, at = threading.Lock(), f":{self.server_port}".removesuffix(":80")
         self.answers = {"/options": hangar.options, "/fly": hangar.fly, "/why": hangar.why}
-        self.answers |= {"/trainings": hangar.trainings, "/training": hangar.training}
+        self.answers |= {"/look": hangar.look, "/trainings": hangar.trainings}
+        self.answers["/training"] = hangar.training
         self.ours = [f"http://{name}{at}" for name in (HOST, "localhost")]
 
     def handle_error(self, *args: Any) -> None:

@@ -1,59 +1,73 @@
 "use strict";
 // The page of the cockpit. It shows what the server answers, and knows no rule of the world.
-// An episode has moments; each has pose, reward, return, d_obs, q, and a frame.
+// An episode has moments: pose, reward, return, d_obs, q, a frame, and maps where somebody looked inside.
 // learning.js is the other view, of a training.
 
 const $ = (id) => document.getElementById(id);
-const [PIXELS, NEAR, SHOWN] = [84, 2.5, 6]; // NEAR: m, from the pointer to what it means; SHOWN: reasons in words
-const ENDS = { goal: "arrived", far: "left by the far edge", side: "left by a side", back: "left by the back", crash: "hit a trunk", time: "ran out of time" };
-const MEANING = {
-  you: "You steer.", network: "The network chosen at the right.", random: "Any turn, each as likely.", straight: "Never turns.",
-  laser: "A planner that measures where the trunks are: more than the camera shows.", plain: "The paper's world. Nothing marks the goal.",
-  beacon: "A pole stands at the goal, and can be seen.", disparity: "The frames show how near things are.",
-};
+const [NEAR, SHOWN] = [2.5, 6]; // m, from the pointer to what it means; how many reasons are told in words
+const ENDS = { goal: "arrived", far: "left by the far edge", side: "left by a side", back: "left by the back",
+  crash: "hit a trunk", time: "ran out of time" };
+const MEANING = { you: "You steer.", network: "The network chosen at the right.", straight: "Never turns.",
+  random: "Any turn, each as likely.", plain: "The paper's world. Nothing marks the goal.",
+  laser: "A planner that measures where the trunks are: more than the camera shows.",
+  beacon: "A pole stands at the goal, and can be seen.", disparity: "The frames show how near things are." };
+const VALUES = { reward: "reward", return: "return so far", d_obs: "nearest trunk, m" };
 const RECORDED = "recorded"; // the pilot of a training's validation episode, which is whole from the start
 const touch = matchMedia("(pointer: coarse)").matches;
-const [ARROWS, SPACE, GO] = touch ? ["◀ left or right ▶", "Play", "Play"] : ["← or →", "space", "Space or Play"];
+const [ARROWS, SPACE, GO, STOP] = touch ? ["◀ left or right ▶", "Play", "Play", "Pause"] :
+  ["← or →", "space", "Space or Play", "Space"];
 let options; // what one may choose from, and the numbers of each world
 let chosen = {}; // world, weights, seed, pilot
 let episode = null; // the episode on show: choice, moments, record, actions, trunks
-let [ghost, plain] = [null, null]; // another one through the same forest, and its label; the one to go back to
+let [ghost, plain] = [null, null]; // another one through the same forest; the one to go back to
 let t = 0; // the moment on show
 let [reasons, removed] = [null, null]; // the answer to "why" of moment t; what is taken out on show
-let [playing, underway] = [false, null]; // underway: the promise of a step that the server has not answered
-let [generation, asked] = [0, 0]; // of episodes, and of what was asked: what an older one waited for is dropped
+let [inside, looking] = [false, null]; // whether the filters are on show; the promise of what they find
+let [playing, underway] = [false, null]; // underway: the promise of a step
+let asked = 0; // counts what was asked: what an older question waited for is dropped
 let kept = {}; // a browser may refuse storage; then a reload forgets what was flown by hand
 try { kept = sessionStorage; } catch {}
 const done = new Map(JSON.parse(kept.done || "[]")); // flown by hand to their end, each once
 const stick = { held: {}, tapped: {}, side: 0, level: 0 };
 
 const world = () => options.worlds[chosen.world];
+const weightsOf = (name) => Object.keys(options.worlds[name]?.weights || {});
 const end = () => episode.moments.length - 1;
 const over = () => episode.record.outcome !== "";
 const ended = ({ record: { outcome } }) => ENDS[outcome];
-const isQ = () => world().weights[chosen.weights] === "dqn"; // an imitated network scores, and knows no return
+const crossed = ({ record: { outcome } }) => outcome === "goal" || outcome === "far";
+const isQ = () => world().weights[chosen.weights] === "dqn"; // an imitation scores, and knows no return
 const score = () => (isQ() ? "Q" : "score");
 const byHand = () => chosen.pilot === "you";
 const recorded = () => chosen.pilot === RECORDED;
 const who = () => (recorded() ? `after ${thousands(chosen.step)} steps` : chosen.pilot);
 const steers = () => byHand() && t === end() && !over();
 const straight = () => (world().num_actions - 1) / 2;
+const result = (e) => `${ENDS[e.outcome]} after ${clock(e.steps)}, return ${number(e.return)}`;
 const number = (x) => (Math.round(10 * x) / 10 || 0).toFixed(1).replace("-", "−"); // never −0.0
 const thousands = (x) => Number(x).toLocaleString("en");
 const clock = (moment) => `${(moment * world().dt).toFixed(1)} s`;
 const signed = (x) => (x < 0 ? "−" : "+") + Math.abs(x).toFixed(2).replace(/^0/, "");
 const rate = (action) => signed(world().yaw_rate * (action / straight() - 1)); // rad/s
-const inWords = (a) => (a === straight() ? "flies straight on" : `turns ${a > straight() ? "left" : "right"} (${rate(a)} rad/s)`);
-const crossed = ({ record: { outcome } }) => outcome === "goal" || outcome === "far";
+const side = (action) => (action > straight() ? "left" : "right");
+const inWords = (a) => (a === straight() ? "flies straight on" : `turns ${side(a)} (${rate(a)} rad/s)`);
 const mean = (values) => values.reduce((sum, x) => sum + x) / values.length;
 const above = (values) => values.map((x) => x - mean(values));
-const svg = (kind) => document.createElementNS("http://www.w3.org/2000/svg", kind);
+const within = (x, last) => Math.max(0, Math.min(x, last));
+const nearest = (far) => far.indexOf(Math.min(...far));
 const kind = (x) => (x === removed ? "removed" : x.weight > 0 ? "for" : "against");
-const pointed = (event, map) => new DOMPoint(event.clientX, event.clientY).matrixTransform(map.getScreenCTM().inverse());
-const addButton = (parent, textContent, onclick) => parent.appendChild(Object.assign(document.createElement("button"), { textContent, onclick }));
 const set = (node, values) => Object.entries(values).forEach(([key, x]) => node.setAttribute(key, x)) || node;
-const say = (text) => void ($("hint").textContent === text || ($("hint").textContent = text)); // read aloud once
-const writeAddress = () => history.replaceState(null, "", `#${new URLSearchParams(learning() ? place : { ...episode.choice, t, actions: episode.actions })}`);
+const say = (text) => $("hint").textContent === text || ($("hint").textContent = text); // read aloud once
+const onShow = () => (learning() ? place : { ...episode.choice, t, actions: episode.actions });
+const writeAddress = () => history.replaceState(null, "", `#${new URLSearchParams(onShow())}`);
+const fill = (id, all, now) => $(id).replaceChildren(...all.map((x) => new Option(x, x, false, x === now)));
+const create = (kind, values) => Object.assign(document.createElement(kind), values);
+const addButton = (parent, textContent, action) =>
+  parent.appendChild(create("button", { textContent, onclick: () => attempt(action) }));
+const drawTime = (max, value, words) => // where the range below stands, in an episode or in a training
+  Object.assign($("time"), { max, value, ariaValueText: ($("clock").textContent = words) });
+const pointed = ({ clientX, clientY }, map) => // where on a map the pointer is, in m; y is downwards
+  new DOMPoint(clientX, clientY).matrixTransform(map.getScreenCTM().inverse());
 
 // -------------------------------------------------- the server
 async function post(path, content) {
@@ -61,18 +75,17 @@ async function post(path, content) {
   if (answer.ok) return answer.json();
   throw new Error((await answer.text()).trim());
 }
-
 const ask = (path, { world, weights, seed }, more) => post(path, { world, weights, seed, ...more });
+const askNow = (path) => ask(path, episode.choice, { actions: episode.actions, time: String(t) });
 
 // Fly these actions, then let the pilot fly `more` steps, and add what is not known yet.
 async function extend(to, actions, more = 0, pilot = "network") {
   const since = String(to.moments.length);
   const answer = await ask("/fly", to.choice, { actions, pilot, more: String(more), since });
-  return Object.assign(to, answer, { moments: [...to.moments, ...answer.moments], actions: answer.record.actions });
+  answer.moments = [...to.moments, ...answer.moments];
+  return Object.assign(to, answer, { actions: answer.record.actions });
 }
-
-// Whether it went well. What fails is told in a line.
-async function attempt(action) {
+async function attempt(action) { // Whether it went well. What fails is told in a line.
   try {
     await action();
     return true;
@@ -83,13 +96,13 @@ async function attempt(action) {
 }
 
 // -------------------------------------------------- episodes
-async function begin(actions, moment) {
-  const me = ++generation;
+async function begin(actions, moment) { // another choice drops what this one waits for
+  const choice = chosen;
   release();
   pause();
-  if (!/^[0-9]{1,18}$/.test(chosen.seed)) throw new Error("The forest is a whole number of at most 18 digits.");
-  const found = await extend({ choice: chosen, moments: [] }, actions);
-  if (me !== generation) return;
+  if (!/^\d{1,18}$/.test(choice.seed)) throw Error("The forest is a whole number of at most 18 digits.");
+  const found = await extend({ choice, moments: [] }, actions);
+  if (choice !== chosen) return;
   [episode, ghost, plain] = [found, null, null];
   drawForest();
   setReasons(null);
@@ -97,42 +110,39 @@ async function begin(actions, moment) {
   help();
   if (!byHand() && moment === null && !learning()) play();
   while (!byHand() && !recorded() && !over()) {
-    await extend(found, found.actions, 25, chosen.pilot);
-    if (me !== generation) return;
+    await extend(found, found.actions, 25, choice.pilot);
+    if (choice !== chosen) return;
     show(playing || t >= moment ? t : Math.min(moment, end()));
   }
-  if (chosen.pilot === "network") return;
-  const other = await extend({ choice: chosen, label: "network", moments: [] }, "", world().max_steps);
-  if (me !== generation) return;
+  if (choice.pilot === "network") return;
+  const other = await extend({ choice, label: "network", moments: [] }, "", world().max_steps);
+  if (choice !== chosen) return;
   [plain, ghost] = [other, ghost || other];
   draw();
 }
-
-// What one can do now.
-function help() {
-  if (learning()) say(touch ? "Tap a way to fly that episode, or a curve to go there." : "← and → go through the training, and so does a click on a curve. Click a way to fly that episode.");
+function help() { // what one can do now
+  if (learning()) say(`${touch ? "Tap" : "Click"} a way to fly that episode, or a curve to go there.`);
   else if (!episode) return;
-  else if (playing && recorded()) say(`${chosen.training}, ${who()} of training. Learning goes back to all episodes.`);
-  else if (playing) say(steers() ? `Hold ${ARROWS} to turn harder. ${touch ? "Pause" : "Space"} pauses.` : "");
-  else if (!steers()) say(`Press ${GO}, or drag the time line. Click a trunk or a bar to ask the network. Or take over, and do better.`);
+  else if (playing && recorded()) say(`${chosen.training}, ${who()}. Learning goes back to all episodes.`);
+  else if (playing) say(steers() ? `Hold ${ARROWS} to turn harder. ${STOP} pauses.` : "");
+  else if (!steers()) say(`Press ${GO}, or drag the time line. Click a trunk or a bar to ask the network.
+    Or take over, and do better.`);
   else if (t) say(`You have the controls: ${ARROWS} fly on from here, ${SPACE} flies straight on.`);
   else say(`Press ${ARROWS} to take off. Hold to turn harder. The network flies along as a ghost.`);
 }
-
 async function steer() {
   if (underway) return;
-  const [me, mine, start] = [generation, asked, performance.now()];
-  underway = extend(episode, episode.actions + turn()).finally(() => (underway = null));
+  const [mine, before, start] = [episode, asked, performance.now()];
+  underway = extend(mine, mine.actions + turn()).finally(() => (underway = null));
   await underway;
-  if (me !== generation) return;
+  if (mine !== episode) return;
   show(end());
   requestAnimationFrame(() => performance.measure("step to frame", { start }));
-  if (mine === asked) help();
+  if (before === asked) help();
   if (!over()) return;
   pause();
-  say(`You: ${ended(episode)}. ${touch ? "Again flies this forest again, Next" : "R flies this forest again, N"} the next one. Or drag the time line, and ask why.`);
+  say(`You: ${ended(mine)}. Fly this forest Again, or the Next. Or drag the time line, and ask why.`);
 }
-
 function turn() {
   const on = (side) => stick.held[side] || stick.tapped[side] || 0;
   const side = on("left") - on("right");
@@ -140,27 +150,25 @@ function turn() {
   [stick.side, stick.tapped] = [side, {}];
   return straight() + side * stick.level;
 }
-
 function hold(side, down) {
   stick.held[side] = down ? 1 : 0;
   if (!down) return;
   if (!steers()) pause(); // what was asked is dropped
-  if (!steers()) return say("To steer, go to a moment before the end and press Take over here. Or press Again.");
+  if (!steers()) return say("To steer, go back before the end and press Take over here. Or press Again.");
   stick.tapped[side] = 1;
   play();
 }
 
 // As it was until moment `from`, then another turn for some steps, then the network to the end.
 async function otherwise(from, action, steps) {
-  const label = `what if ${rate(action)} at ${clock(from)}`;
-  const words = `The dashed path ${inWords(action)} at ${clock(from)} for ${clock(steps)}, then the network flies on`;
-  const other = { ...episode, from, label, words, whole: true, record: { outcome: "" } };
+  const [at, label] = [clock(from), `what if ${rate(action)} at ${clock(from)}`];
+  const words = `The dashed path ${inWords(action)} at ${at} for ${clock(steps)}, then the network flies on`;
+  const other = { ...episode, from, at, label, words, whole: true, record: { outcome: "" } };
   [other.moments, other.actions] = [episode.moments.slice(0, from), episode.actions.slice(0, from)];
   // The turn may end the episode, and no action can follow that.
   for (let i = 0; i < steps && !other.record.outcome; i++) await extend(other, other.actions + action);
   return extend(other, other.actions, world().max_steps);
 }
-
 async function whatIf(action) {
   const me = await settle();
   if (me !== asked) return;
@@ -169,16 +177,14 @@ async function whatIf(action) {
   if (me !== asked) return;
   ghost?.words === other.words ? clear() : compare(other); // the same bar again takes it away
 }
-
 function compare(other, known = "") {
   ghost = other;
   show(other.from);
-  say(`${known}${other.words}: ${ended(other)}, return ${number(other.record.return)}. Esc, or the same bar, takes it away.`);
+  say(`${known}${other.words}: ${result(other.record)}. Esc, or the same bar, takes it away.`);
 }
-
 function clear() {
   pause();
-  ghost = plain;
+  [ghost, inside] = [plain, false];
   setReasons(null);
   draw();
 }
@@ -196,62 +202,49 @@ async function wentWrong() {
     for (const action of [2 * straight(), straight(), 0]) {
       const other = await otherwise(from, action, steps);
       if (me !== asked) return;
-      if (crossed(other)) return compare(other, `Of each half second, the last way out was at ${clock(from)}. `);
+      if (crossed(other)) return compare(other, `Of each half second, the last way out was at ${other.at}. `);
     }
   }
-  const nothing = `Nothing saves it: left, straight on and right for 0.5 s were tried at each half second from ${clock(from)} on.`;
+  const tried = `left, straight on and right for 0.5 s were tried at each half second from ${clock(from)} on`;
+  const nothing = `Nothing saves it: ${tried}.`;
   if (!isQ()) return say(nothing);
   const best = episode.moments.map(({ q }) => Math.max(...q));
-  const falls = best.slice(1, -1).map((x, i) => best[i] - x);
-  show(Math.max(falls.indexOf(Math.max(...falls)), 0));
+  show(Math.max(nearest(best.slice(1, -1).map((x, i) => x - best[i])), 0));
   say(`${nothing} After ${clock(t)} the greatest Q falls most.`);
 }
 
 // -------------------------------------------------- why
 async function why(trunk = null) {
   const [me, moment] = [await settle(), t];
-  const answer = reasons || (await ask("/why", episode.choice, { actions: episode.actions, time: String(moment) }));
+  const answer = reasons || (await askNow("/why"));
   if (me !== asked || moment !== t) return;
   setReasons(answer, removed && removed.trunk === trunk ? null : trunk);
   draw();
-  if (trunk !== null && answer.without.every((x) => x.trunk !== trunk)) say("That is in none of the four frames: without it nothing would change.");
+  const seen = trunk === null || answer.without.some((x) => x.trunk === trunk);
+  if (!seen) say("That is in none of the four frames: without it nothing would change.");
 }
-
 function setReasons(answer, trunk = null) {
-  const things = answer ? [...answer.without].sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight)) : [];
-  [reasons, removed] = [answer, things.find((x) => x.trunk === trunk) || null];
+  const things = answer ? answer.without.slice(0, SHOWN) : [];
+  [reasons, removed] = [answer, answer?.without.find((x) => x.trunk === trunk) || null];
   const lead = answer && signed(above(answer.before)[answer.chosen]).slice(1);
-  $("answer").innerHTML = !answer ? "" : `<p>The network ${inWords(answer.chosen)}: this ${score()} is ${lead} above the mean of the nine. The numbers say how much
-    of that is lost without one trunk: <b class="for">+ is a reason for</b> the turn, <b class="against">− a reason against</b> it.</p><div></div>`;
-  for (const x of things.slice(0, SHOWN)) {
-    const name = x.trunk < 0 ? "the goal's pole" : whereabouts(episode.trunks[x.trunk]);
-    const button = addButton($("answer").lastChild, `${name} ${signed(x.weight)}`, () => attempt(() => why(x.trunk)));
+  $("answer").innerHTML = !answer ? "" : `<p>The network ${inWords(answer.chosen)}: this ${score()} is ${lead}
+    above the mean of the nine. The numbers say how much of that is lost without one trunk: <b class="for">+
+    is a reason for</b> the turn, <b class="against">− a reason against</b> it.</p><div class="row"></div>`;
+  for (const x of things) {
+    const button = addButton($("answer").lastChild, `${x.name} ${signed(x.weight)}`, () => why(x.trunk));
     set(button, { class: x.weight > 0 ? "for" : "against", "aria-pressed": x === removed });
   }
-  $("marks").innerHTML = things.slice(0, SHOWN).map(outline).join("");
+  const outline = (x, [left, top, width, height]) =>
+    `<rect class="${kind(x)}" x="${left}" y="${top}" width="${width}" height="${height}"/>`;
+  $("marks").innerHTML = things.filter((x) => x.box.length).map((x) => outline(x, x.box)).join("");
   drawTrunks();
 }
-
-// Where a thing stands in the newest frame: around the pixels that change without it.
-function outline(x) {
-  const [before, after] = [episode.moments[t].frame, x.frame].map(atob);
-  const changed = [...before].flatMap((pixel, i) => (pixel === after[i] ? [] : [i]));
-  const span = (of) => [Math.min(...changed.map(of)), Math.max(...changed.map(of)) + 1];
-  const [[left, right], [top, low]] = [span((i) => i % PIXELS), span((i) => Math.floor(i / PIXELS))];
-  return changed.length ? `<rect class="${kind(x)}" x="${left}" y="${top}" width="${right - left}" height="${low - top}"/>` : "";
-}
-
-function whereabouts([x, y]) {
-  const [px, py, heading] = episode.moments[t].pose;
-  const left = (y - py) * Math.cos(heading) - (x - px) * Math.sin(heading);
-  return `${Math.hypot(x - px, y - py).toFixed(0)} m off, ${Math.abs(left).toFixed(1)} m ${left > 0 ? "left" : "right"}`;
-}
-
 function clickMap(event) {
   const { x: px, y: py } = pointed(event, $("map"));
-  const things = [...episode.trunks.entries(), ...(world().beacon ? [[-1, [world().length, 0]]] : [])];
-  const far = things.map(([i, [x, y]]) => [Math.hypot(x - px, y + py), i]).sort((a, b) => a[0] - b[0]);
-  if (far[0][0] < NEAR) attempt(() => why(far[0][1]));
+  const things = [...episode.trunks, ...(world().beacon ? [[world().length, 0]] : [])];
+  const far = things.map(([x, y]) => Math.hypot(x - px, y + py));
+  const trunk = nearest(far) < episode.trunks.length ? nearest(far) : -1; // -1: the goal's pole
+  if (Math.min(...far) < NEAR) attempt(() => why(trunk));
 }
 
 // -------------------------------------------------- play
@@ -266,14 +259,12 @@ async function settle() {
   await underway;
   return me;
 }
-
 function setPlaying(on) {
   [playing, asked] = [on, asked + 1];
   $("play").textContent = on ? "Pause" : "Play";
   help();
   if (on) attempt(loop);
 }
-
 async function loop() {
   let [me, due] = [asked, performance.now()];
   if (t === end() && over()) show(0);
@@ -285,13 +276,11 @@ async function loop() {
     await new Promise((wake) => setTimeout(wake, due - performance.now()));
   }
 }
-
 function stepTo(moment) {
-  show(Math.max(Math.min(moment, end()), 0));
+  show(within(moment, end()));
   pause();
   if (moment > end() && steers()) attempt(steer);
 }
-
 function show(moment) {
   if (moment !== t && reasons) setReasons(null);
   t = moment;
@@ -302,156 +291,161 @@ function show(moment) {
 }
 
 // -------------------------------------------------- drawing
-// The empty forest of a map.
-function drawGround(map, { length, width, back, goal_radius }) {
+function drawGround(map, { length, width, back, goal_radius }) { // the empty forest of a map
   set(map, { viewBox: `${-back - 1} ${-width / 2 - 1} ${length + back + 5} ${width + 2}` });
   set(map.querySelector(".ground"), { x: -back, y: -width / 2, width: length + back, height: width });
   set(map.querySelector(".goal"), { cx: length, r: goal_radius });
 }
-
 function drawForest() {
-  const { length, num_actions, beacon } = world();
+  const { length, num_actions, beacon, view } = world();
   drawGround($("map"), world());
   set($("pole"), { cx: length, r: beacon ? 0.7 : 0 });
-  const circle = ([cx, y]) => set(svg("circle"), { cx, cy: -y });
-  $("trunks").replaceChildren(...episode.trunks.map(circle));
-  for (let a = num_actions - 1; a >= 0 && $("bars").children.length < num_actions; a--) {
-    const bar = addButton($("bars"), "", () => attempt(() => whatIf(a)));
-    bar.innerHTML = `<span></span><span class="well"><i></i><i class="other"></i></span><span class="rate">${rate(a)}</span><span class="after"></span>`;
-  }
+  const edge = view * Math.tan(options.half_view);
+  set($("view"), { d: `M0 0L${view} ${edge}V${-edge}Z` });
+  $("trunks").innerHTML = episode.trunks.map(([x, y]) => `<circle cx="${x}" cy="${-y}"/>`).join("");
+  if ($("bars").firstChild) return;
+  for (let a = num_actions - 1; a >= 0; a--) addButton($("bars"), "", () => whatIf(a)); // left is leftmost
 }
-
 function draw() {
-  paint($("seen"), removed ? removed.frame : episode.moments[t].frame);
-  [...$("stack").children].forEach((canvas, i) => paint(canvas, episode.moments[Math.max(t - 3 + i, 0)].frame));
-  [drawMap, drawBars, drawCurves, drawTable].forEach((part) => part());
-  [$("time").max, $("time").value] = [end(), t];
-  set($("time"), { "aria-valuetext": clock(t) });
-  $("clock").textContent = `${clock(t)} of ${clock(end())}`;
-  const banner = t === end() && over() && `${ended(episode)}, return ${number(episode.record.return)}`;
-  $("banner").textContent = removed ? `without ${removed.trunk < 0 ? "the goal's pole" : "this trunk"} (Esc puts it back)` : banner || "";
+  if (learning()) return;
+  const frame = (ago) => episode.moments[Math.max(t - ago, 0)].frame;
+  paint($("seen"), removed ? removed.frame : frame(0));
+  [...$("look").children].forEach((canvas, i) => paint(canvas, frame(3 - i)));
+  drawMap();
+  drawBars();
+  drawLines("curves", VALUES, episode.moments, (_, i) => i / Math.max(end(), 1), t);
+  drawTable();
+  attempt(drawInside);
+  drawTime(end(), t, `${clock(t)} of ${clock(end())}`);
+  const last = t === end() && over() ? result(episode.record) : "";
+  $("banner").textContent = removed ? `without: ${removed.name} (Esc puts it back)` : last;
 }
-
 function paint(canvas, frame) {
-  const [grey, image] = [atob(frame), new ImageData(PIXELS, PIXELS)];
+  const grey = atob(frame);
+  canvas.width = canvas.height = Math.sqrt(grey.length);
+  const image = new ImageData(canvas.width, canvas.height);
   const colours = new Uint32Array(image.data.buffer);
   for (let i = 0; i < grey.length; i++) colours[i] = 0xff000000 + 0x10101 * grey.charCodeAt(i);
   canvas.getContext("2d").putImageData(image, 0, 0);
 }
-
-function drawMap() {
-  const path = (moments) => moments.map(({ pose: [x, y] }) => `${x.toFixed(2)},${(-y).toFixed(2)}`).join(" ");
-  const place = ([x, y, heading]) => `translate(${x} ${-y}) rotate(${(-heading * 180) / Math.PI})`;
-  const edge = world().view * Math.tan(options.half_view);
-  for (const id of ["drone", "view"]) set($(id), { transform: place(episode.moments[t].pose) });
-  set($("view"), { d: `M0 0L${world().view} ${edge}V${-edge}Z` });
-  set($("whole-path"), { points: path(episode.moments) });
-  set($("path"), { points: path(episode.moments.slice(0, t + 1)) });
-  // Who flies by hand should not see where the ghost is going to turn.
-  const known = ghost ? ghost.moments.slice(0, byHand() && !over() && !ghost.whole ? t + 1 : undefined) : [];
-  set($("ghost-path"), { points: path(known) });
-  const at = ghost && ghost.moments[Math.min(t, ghost.moments.length - 1)].pose;
-  set($("ghost"), { transform: at ? place(at) : "translate(-99 0)" });
-  [$("main-name").textContent, $("ghost-name").textContent, $("ghost-mark").hidden] = [who(), ghost ? ghost.label : "", !ghost];
+async function drawInside() { // what the filters of the first layer find; each moment is asked for once
+  // A recorded way shows it only with the weights of its own training.
+  const here = !recorded() || chosen.weights === chosen.training.replace("results/", "");
+  const [moment, open] = [episode.moments[t], here && inside];
+  [$("look").disabled, $("look").ariaExpanded, $("inside").hidden] = [!here, open, !open];
+  if (!open || (looking && !moment.maps)) return;
+  if (moment.maps) return $("maps").childNodes.forEach((canvas, i) => paint(canvas, moment.maps[i]));
+  looking = askNow("/look").finally(() => (looking = null));
+  moment.maps = (await looking).maps;
+  if (!$("maps").firstChild) $("maps").innerHTML = "<canvas></canvas>".repeat(moment.maps.length);
+  return drawInside(); // the flight may have gone on
 }
-
+function drawMap() {
+  const path = (id, moments) =>
+    set($(id), { points: moments.map(({ pose: [x, y] }) => `${x.toFixed(2)},${(-y).toFixed(2)}`).join(" ") });
+  const place = (id, { pose: [x, y, heading] }) =>
+    set($(id), { transform: `translate(${x} ${-y}) rotate(${(-heading * 180) / Math.PI})` });
+  for (const id of ["drone", "view"]) place(id, episode.moments[t]);
+  path("whole-path", episode.moments);
+  path("path", episode.moments.slice(0, t + 1));
+  const { moments, label, whole } = ghost || { moments: [{ pose: [-99, 0, 0] }], label: "" };
+  // Who flies by hand should not see where the ghost is going to turn.
+  path("ghost-path", byHand() && !over() && !whole ? moments.slice(0, t + 1) : moments);
+  place("ghost", moments[Math.min(t, moments.length - 1)]);
+  [$("main-name").textContent, $("ghost-name").textContent] = [who(), label];
+  $("ghost-mark").hidden = !ghost;
+}
 function drawTrunks() {
   const found = new Map((reasons ? reasons.without : []).map((x) => [x.trunk, x]));
   const most = Math.max(...[...found.values()].map((x) => Math.abs(x.weight)), 1e-9);
   const colour = (node, x, r) => {
-    const share = x ? Math.abs(x.weight) / most : 0;
-    set(node, { class: x ? kind(x) : node.id, r: r * (1 + share), "fill-opacity": x ? 0.3 + 0.7 * share : 1 });
+    const part = x ? Math.abs(x.weight) / most : 0;
+    set(node, { class: x ? kind(x) : node.id, r: r * (1 + part), "fill-opacity": x ? 0.3 + 0.7 * part : 1 });
   };
   colour($("goal"), found.get(-1), world().goal_radius);
   [...$("trunks").children].forEach((circle, i) => colour(circle, found.get(i), 1.2 * world().trunk_radius));
 }
-
 function drawBars() {
-  const [q, other] = [episode.moments[t].q, removed && removed.q];
-  const [own, without] = [above(q), above(other || q)];
-  const reach = 2 ** Math.ceil(Math.log2(Math.max(0.1, ...own.map(Math.abs), ...without.map(Math.abs))));
-  const stretch = ({ style }, x) => ([style.top, style.height] = [`${50 - (50 * Math.max(x, 0)) / reach}%`, `${(50 * Math.abs(x)) / reach}%`]);
+  const { q } = episode.moments[t];
+  const other = removed ? removed.q : q;
+  const [own, without] = [above(q), above(other)];
+  const reach = 2 ** Math.ceil(Math.log2(Math.max(0.1, ...[...own, ...without].map(Math.abs))));
   $("scale").textContent = `line: the mean, ${number(mean(q))}; frame: ±${reach}`;
-  [...$("bars").children].forEach((bar, i) => {
-    const a = q.length - 1 - i; // the sharpest left turn stands leftmost
-    const [value, { children: [first, second] }, , after] = bar.children;
-    [value.textContent, after.textContent, second.hidden] = [number(q[a]), other ? number(other[a]) : "", !other];
-    stretch(first, own[a]);
-    stretch(second, without[a]);
-    bar.classList.toggle("best", q[a] === Math.max(...q));
-    bar.classList.toggle("flown", episode.actions[t] === String(a));
-    set(bar, { "aria-label": `${rate(a)} radians a second: ${score()} ${number(q[a])}. What if it turned so?` });
+  const bar = (x, kind) =>
+    `<rect class="${kind}" y="${-Math.max(x, 0) / reach}" width="1" height="${Math.abs(x) / reach}"/>`;
+  [...$("bars").children].reverse().forEach((button, a) => {
+    const label = `${rate(a)} radians a second: ${score()} ${number(q[a])}. What if it turned so?`;
+    set(button, { "aria-label": label });
+    button.classList.toggle("best", q[a] === Math.max(...q));
+    button.classList.toggle("flown", episode.actions[t] === String(a));
+    button.innerHTML = `<span>${number(q[a])}</span><svg viewBox="0 -1 1 2" preserveAspectRatio="none">
+      <path d="M-9 0H9"/>${bar(own[a], "own")}${removed ? bar(without[a], "other") : ""}</svg>
+      <span class="rate">${rate(a)}</span><span class="after">${removed ? number(other[a]) : ""}</span>`;
   });
 }
 
-// A line through points [x, y], x from 0 to 1, with a cursor, over a band of [x, least, greatest].
-function curve(name, value, line, cursor, band = []) {
-  const ys = [...line, ...band].flatMap(([, ...y]) => y);
-  const [low, high] = [Math.min(0, ...ys), Math.max(1, ...ys)];
-  const place = ([x, y]) => `${(100 * x).toFixed(2)} ${(30 - (30 * (y - low)) / (high - low)).toFixed(2)}`;
-  const path = (kind, points) => (points.length ? `<path class="${kind}" fill="none" stroke-width="1.5" vector-effect="non-scaling-stroke" d="M${points.map(place).join("L")}"/>` : "");
-  const around = [...band, ...band.map(([x, , greatest]) => [x, greatest]).reverse()];
-  const paths = [path("band", around), path("line", line), path("cursor", [[cursor, low], [cursor, high]])].join("");
-  return `<div class="curve"><span>${name} <b>${number(value)}</b></span><svg viewBox="0 0 100 30" preserveAspectRatio="none"
-    aria-hidden="true">${paths}</svg><small><i>${number(high)}</i><i>${number(low)}</i></small></div>`;
+// Values of all rows as lines. at: where a row is, 0 to 1; now: the one on show; band: [least, greatest].
+function drawLines(id, names, rows, at, now, band = []) {
+  const line = ([key, name]) => {
+    const factor = name.endsWith("%") ? 100 : 1;
+    const points = rows.map((row, i) => [at(row, i), factor * row[key]]);
+    const [least, most] = [0, 1].map((i) => band.map((row) => [at(row), factor * row[key][i]]));
+    const ys = [...points, ...least, ...most].map(([, y]) => y);
+    const [low, high] = [Math.min(0, ...ys), Math.max(1, ...ys)];
+    const place = ([x, y]) => `${(100 * x).toFixed(2)} ${(30 - (30 * (y - low)) / (high - low)).toFixed(2)}`;
+    const path = (kind, line) => `<path class="${kind}" d="M${line.map(place).join("L")}"/>`;
+    const [x, y] = points[now];
+    return `<div class="curve"><span>${name} <b>${number(y)}</b></span><svg viewBox="0 0 100 30" fill="none"
+      preserveAspectRatio="none" stroke-width="1.5" aria-hidden="true">
+      ${band.length ? path("band", [...least, ...most.reverse()]) : ""}${path("line", points)}
+      ${path("cursor", [[x, low], [x, high]])}</svg>
+      <small><i>${number(high)}</i><i>${number(low)}</i></small></div>`;
+  };
+  $(id).innerHTML = Object.entries(names).map(line).join("");
 }
-
-function drawCurves() {
-  const share = (moment) => moment / Math.max(end(), 1);
-  const line = (key) => episode.moments.map((moment, i) => [share(i), moment[key]]);
-  const names = Object.entries({ reward: "reward", return: "return so far", d_obs: "nearest trunk, m" });
-  $("curves").innerHTML = names.map(([key, name]) => curve(name, episode.moments[t][key], line(key), share(t))).join("");
-}
-
 function drawTable() {
-  const episodes = [{ ...episode, label: who() }, ghost].filter(Boolean);
-  const known = (f) => ended(f) && (over() || f.whole);
-  const rows = { end: ended, steps: (f) => f.record.steps, return: (f) => number(f.record.return) };
-  const line = (name, cell) => `<tr><th scope="row">${name}</th>${episodes.map((f) => `<td>${cell(f)}</td>`).join("")}</tr>`;
-  const body = Object.entries(rows).map(([name, cell]) => line(name, (f) => (known(f) ? cell(f) : "…")));
-  $("table").innerHTML = line("", (f) => `<b>${f.label}</b>`) + body.join("");
+  const known = (f) => ENDS[f.record.outcome] && (over() || f.whole);
+  const row = (f) => `<tr><th>${f.label}</th><td>${known(f) ? result(f.record) : "…"}</td></tr>`;
+  $("table").innerHTML = row({ ...episode, label: who() }) + (ghost ? row(ghost) : "");
 }
 
 // -------------------------------------------------- choices, address, file
 async function choose(change, actions = "", moment = null) {
   const after = (chosen = { ...chosen, ...change });
   if (recorded() && !actions) chosen.pilot = "network"; // in another forest
-  chosen.weights ||= Object.keys(world().weights)[0];
+  chosen.weights ||= weightsOf(chosen.world)[0];
   drawChoices();
   const well = await attempt(() => begin(actions, moment));
   if (!well && episode && chosen === after) chosen = episode.choice;
   drawChoices();
   return well;
 }
-
 function drawChoices() {
-  const names = { pilot: options.pilots, world: Object.keys(options.worlds) };
-  for (const [key, all] of Object.entries(names)) {
-    const row = $(`${key}s`), add = (name) => addButton(row, name, () => choose(key === "world" ? { world: name, weights: "" } : { pilot: name }));
-    if (!row.children.length) all.forEach((name) => set(add(name), { title: MEANING[name] || "" }));
-    for (const button of row.children) set(button, { "aria-pressed": button.textContent === chosen[key] });
-    if (key === "world") all.forEach((name, i) => (row.children[i].disabled = !Object.keys(options.worlds[name].weights).length));
+  for (const button of document.querySelectorAll("#pilots button, #worlds button")) {
+    const name = button.textContent;
+    set(button, { "aria-pressed": name === chosen.pilot || name === chosen.world });
+    button.disabled = name in options.worlds && !weightsOf(name).length;
   }
-  $("weights").replaceChildren(...Object.keys(world().weights).map((name) => new Option(name, name, false, name === chosen.weights)));
-  $("seed").value = chosen.seed;
-  [$("stick").hidden, $("q").hidden, $("scores").hidden] = [!byHand(), !isQ(), isQ()];
+  fill("weights", weightsOf(chosen.world), chosen.weights);
+  [$("seed").value, $("stick").hidden] = [chosen.seed, !byHand()];
+  $("meaning").textContent = isQ() ? "Q: the return to expect after each turn, in rad/s." : `Scores: what the
+    expert that this network imitates would say of each turn, in rad/s (only differences count).`;
 }
-
 async function restore() {
   const told = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
-  const first = { pilot: "you", world: Object.keys(options.worlds)[0], seed: told.seed || "1", weights: told.weights };
+  const { training, step, weights, seed = "1" } = told;
+  const first = { pilot: "you", world: Object.keys(options.worlds)[0], seed, weights };
   if (options.pilots.includes(told.pilot)) first.pilot = told.pilot;
-  if (told.world in options.worlds && Object.keys(options.worlds[told.world].weights).length) first.world = told.world;
-  if (told.training) place = { training: told.training, step: told.step };
-  if (told.pilot === RECORDED && told.training && told.step > 0) Object.assign(first, place, { pilot: RECORDED });
+  if (weightsOf(told.world).length) first.world = told.world;
+  if (training) place = { training, step };
+  if (told.pilot === RECORDED && training && step > 0) Object.assign(first, place, { pilot: RECORDED });
   if (!episode) chosen = first;
-  if (told.training && !told.seed) return attempt(openLearning);
+  if (training && !told.seed) return attempt(openLearning);
   setView(false);
   if (await choose(first, told.actions, Math.trunc(Math.abs(Number(told.t))) || 0) || episode) return;
   const wrong = $("hint").textContent;
   if (await choose({ seed: "1", weights: "" })) say(wrong);
 }
-
 async function share() {
   pause();
   writeAddress();
@@ -459,33 +453,33 @@ async function share() {
   const what = learning() ? "this training at this validation" : "this episode at this moment";
   say(`The address of this page holds ${what}.${copied} It opens where a cockpit runs at ${location.host}.`);
 }
-
 function save() {
   pause();
-  const episodes = [...done.values()].filter((f) => f.world === chosen.world && f.seed < options.train_end);
-  const left = done.size === episodes.length ? "" : ` Left out: ${done.size - episodes.length}, of another world, or of a forest from 1,000,000,000 up (those are for validation and tests).`;
-  if (!episodes.length) return say(`There is no episode to save. Fly by hand to an end, in a forest below 1,000,000,000.${left}`);
-  const [{ beacon, camera }, pilots] = [world(), { you: { episodes: episodes.map(({ world, ...record }) => record) } }];
+  const mine = [...done.values()].filter((f) => f.world === chosen.world && f.seed < options.train_end);
+  const [others, { beacon, camera }] = [done.size - mine.length, world()];
+  const left = others ? ` Left out: ${others}, of another world or of a forest from 1,000,000,000 up.` : "";
+  if (!mine.length) return say(`There is no episode to save. Fly by hand to an end in this world.${left}`);
+  const pilots = { you: { episodes: mine.map(({ world, ...record }) => record) } };
   const file = new Blob([JSON.stringify({ beacon, camera, pilots })], { type: "application/json" });
-  Object.assign(document.createElement("a"), { href: URL.createObjectURL(file), download: "episodes.json" }).click();
+  create("a", { href: URL.createObjectURL(file), download: "episodes.json" }).click();
   const flags = (beacon ? " --beacon" : "") + (camera === "grey" ? "" : ` --camera ${camera}`);
-  say(`Episodes in the file episodes.json: ${episodes.length}.${left} To learn from them: .venv/bin/python -m extras.lessons.demonstrations train --demos FILE --demo-pilot you${flags}`);
+  say(`Episodes in the file episodes.json: ${mine.length}.${left} To learn from them: .venv/bin/python -m
+    extras.lessons.demonstrations train --demos FILE --demo-pilot you${flags}`);
 }
 
 // -------------------------------------------------- keys and buttons
+const go = (by) => (learning() ? goTo(at + by) : stepTo(t + by));
 const actions = {
-  play: () => (playing ? pause() : play()), back: () => stepTo(t - 1), step: () => stepTo(t + 1),
-  sooner: () => goTo(at - 1), later: () => goTo(at + 1), learning: () => attempt(openLearning), flying: openFlying,
+  play: () => (playing ? pause() : play()), back: () => go(-1), step: () => go(1),
   next: () => choose({ seed: String(BigInt(chosen.seed) + 1n) }),
   again: () => choose({}, recorded() ? episode.actions : ""),
   random: () => choose({ seed: String(Math.floor(Math.random() * options.train_end)) }),
   take: () => choose({ pilot: "you" }, episode.actions.slice(0, over() ? Math.min(t, end() - 1) : t), t),
-  why: () => attempt(() => why()), wrong: () => attempt(wentWrong),
-  clear, share, save,
+  look: () => draw((inside = !inside)),
+  why: () => why(), wrong: wentWrong, learning: () => openLearning(), flying: openFlying, clear, share, save,
 };
 const KEYS = { " ": "play", ",": "back", ".": "step", n: "next", r: "again", w: "why", Escape: "clear" };
 const SIDES = { ArrowLeft: "left", a: "left", ArrowRight: "right", d: "right" };
-
 function key(event) {
   const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const own = event.target.matches("input, select") || (name === " " && event.target.matches("button"));
@@ -495,10 +489,9 @@ function key(event) {
   if (learning()) return learningKey(event);
   if (!episode || !(side || action)) return;
   event.preventDefault();
-  if (action) action();
+  if (action) attempt(action);
   else if (!event.repeat) hold(side, true);
 }
-
 function listen() {
   const on = (id, event, action) => $(id).addEventListener(event, action);
   for (const type of ["keydown", "keyup"]) document.addEventListener(type, key);
@@ -506,13 +499,19 @@ function listen() {
   window.addEventListener("hashchange", restore);
   document.addEventListener("visibilitychange", () => document.hidden && (release(), pause()));
   // What was clicked by a mouse would keep the focus, and take the keys that steer.
-  document.addEventListener("click", (event) => event.detail && event.target.matches("button, [type=range]") && event.target.blur());
-  const hands = Object.entries({ pointerdown: true, pointerup: false, pointerleave: false, pointercancel: false });
-  for (const side of ["left", "right"]) for (const [name, down] of hands) on(side, name, () => hold(side, down));
-  for (const [name, action] of Object.entries(actions)) if ($(name)) on(name, "click", () => (episode || learning()) && action());
+  const leave = ({ detail, target }) => detail && target.closest("button, [type=range]")?.blur();
+  document.addEventListener("click", leave);
+  const hands = ["pointerdown", "pointerup", "pointerleave", "pointercancel"];
+  for (const side of ["left", "right"])
+    for (const name of hands) on(side, name, () => hold(side, name === "pointerdown"));
+  const act = (action) => (episode || learning()) && attempt(action);
+  for (const [name, action] of Object.entries(actions)) if ($(name)) on(name, "click", () => act(action));
+  const offer = (id, name, change) => (addButton($(id), name, () => choose(change)).title = MEANING[name]);
+  for (const pilot of options.pilots) offer("pilots", pilot, { pilot });
+  for (const world of Object.keys(options.worlds)) offer("worlds", world, { world, weights: "" });
   listenLearning(on);
   on("map", "click", clickMap);
-  on("time", "input", () => stepTo(Number($("time").value)));
+  on("time", "input", () => go(Number($("time").value) - (learning() ? at : t)));
   on("seed", "change", () => choose({ seed: $("seed").value.trim() }));
   on("weights", "change", () => choose({ weights: $("weights").value }, recorded() ? episode.actions : ""));
   for (const id of ["seed", "weights", "hold", "speed"]) on(id, "change", () => $(id).blur());

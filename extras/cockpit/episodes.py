@@ -88,11 +88,13 @@ def check(ask: Any, keys: str) -> None:
 
 
 @cache
-def read_network(path: Path, _changed: int) -> tuple[QNetwork, World, str]:
-    """A network, its world, and the name of its pilot; InputError if it is no weights file.
+def read_network(path: Path, _changed: int) -> tuple[QNetwork | None, World | None, str]:
+    """A network, its world, and the name of its pilot; no world if it is no weights file.
     _changed: when the file was written, because a training writes it again."""
-    q, world, pilot = load_weights(path)
-    return q.requires_grad_(False), world, pilot
+    with suppress(InputError):
+        q, world, pilot = load_weights(path)
+        return q.requires_grad_(False), world, pilot
+    return None, None, ""
 
 
 def settings(folder: Path) -> dict[str, Any]:
@@ -140,9 +142,8 @@ class Hangar:
         paths |= {f"runs/{path.parent.name}": path for path in self.root.glob("runs/*/best.pt")}
         found = {}
         for name, path in sorted(paths.items()):
-            with suppress(InputError):
-                q, home, pilot = read_network(path, path.stat().st_mtime_ns)
-                found |= {name: (q, pilot)} if home == WORLDS[world] else {}
+            q, home, pilot = read_network(path, path.stat().st_mtime_ns)
+            found |= {name: (q, pilot)} if home == WORLDS[world] else {}
         return found
 
     def find(self, ask: dict[str, str]) -> Recording:
@@ -187,27 +188,45 @@ class Hangar:
         drone, moments = recording.drone, recording.moments[int(ask["since"]) :]
         return {"record": drone.episode(), "trunks": drone.trunks.tolist(), "moments": moments}
 
-    def why(self, ask: Any) -> dict[str, Any]:
-        """What each thing in view does to the decision at moment `time`: Q with and without it.
-
-        `weight` says how much of the chosen action's advantage hangs on it: its Q less the mean of
-        all Q. Trunk -1 is the goal's pole. A trunk that changes no pixel is left out.
-        """
+    def moment(self, ask: Any) -> tuple[Recording, ndarray]:
+        """The episode of a request, and where the frames of moment `time` were taken (4, 3)."""
         check(ask, "world weights seed actions time")
         recording, t = self.find(ask), int(ask["time"])
         if t >= len(recording.moments):
             raise ValueError(f"time is {t}, and the episode has {len(recording.moments) - 1} steps")
         last = [recording.moments[max(t - k, 0)]["pose"] for k in reversed(range(STACK))]
-        names, s = without(np.array(last), recording)  # (R,), (R, 4, 84, 84)
+        return recording, np.array(last)
+
+    def look(self, ask: Any) -> dict[str, list[str]]:
+        """What each filter of the first convolution makes of the frames of moment `time`, after
+        ReLU. On one scale for all of them: 0 is black, and the greatest value is white."""
+        recording, poses = self.moment(ask)
+        drone, layer = recording.drone, recording.q.conv[:2]
+        s = np.array([draw_frame(pose, drone.trunks, drone.world) for pose in poses])  # (4, 84, 84)
+        maps = layer(torch.from_numpy(s) / 255).numpy()  # (32, 20, 20)
+        grey = (255 * maps / max(maps.max(), 1e-9)).round().astype(np.uint8)
+        return {"maps": [b64encode(x).decode() for x in grey]}
+
+    def why(self, ask: Any) -> dict[str, Any]:
+        """What each thing in view does to the decision at moment `time`: Q with and without it.
+
+        `weight` says how much of the chosen action's advantage hangs on it: its Q less the mean of
+        all Q; the greatest comes first. Trunk -1 is the goal's pole. A trunk that changes no pixel
+        is left out.
+        """
+        recording, poses = self.moment(ask)
+        names, s = without(poses, recording)  # (R,), (R, 4, 84, 84)
         changed = np.flatnonzero((s != s[0]).any((1, 2, 3)))  # of R: what is in view
         before, *after = recording.q.values(s[[0, *changed]], ()).tolist()
         chosen = int(np.argmax(before))
         advantage, *rest = [q[chosen] - float(np.mean(q)) for q in (before, *after)]
         reasons = [
             {"trunk": int(names[i]), "q": q, "weight": advantage - other,
-             "frame": b64encode(s[i, -1]).decode()}
+             "name": whereabouts(names[i], poses[-1], recording.drone.trunks),
+             "frame": b64encode(s[i, -1]).decode(), "box": box(s[i, -1] != s[0, -1])}
             for i, q, other in zip(changed, after, rest, strict=True)
         ]  # fmt: skip
+        reasons.sort(key=lambda x: -abs(x["weight"]))
         return {"before": before, "chosen": chosen, "without": reasons}
 
     def folders(self) -> dict[str, Path]:
@@ -261,3 +280,20 @@ def without(poses: ndarray, recording: Recording) -> tuple[list[int], ndarray]:
     scenes = [(trunks, world), *((np.delete(trunks, i, 0), world) for i in near)]
     scenes.append((trunks, replace(world, beacon=False)))
     return [-2, *near, -1], np.array([[draw_frame(p, *scene) for p in poses] for scene in scenes])
+
+
+def whereabouts(i: int, pose: ndarray, trunks: ndarray) -> str:
+    """Where trunk i stands, in words; -1 is the goal's pole."""
+    if i < 0:
+        return "the goal's pole"
+    ahead, left = seen_from(pose, trunks[i])
+    side = "left" if left > 0 else "right"
+    return f"{np.hypot(ahead, left):.0f} m off, {abs(left):.1f} m {side}"
+
+
+def box(changed: ndarray) -> list[int]:
+    """Left, top, width and height of what changed in a frame (84, 84); [] if nothing did."""
+    if not changed.any():
+        return []
+    low, high = [f(np.argwhere(changed)[:, ::-1], axis=0) for f in (np.min, np.max)]  # x, y
+    return [*low.tolist(), *(high - low + 1).tolist()]

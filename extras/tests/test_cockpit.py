@@ -132,7 +132,34 @@ def test_removal_is_what_one_gets_by_drawing_every_frame_again(
         before, a = answer["before"], answer["chosen"]
         lost = (before[a] - np.mean(before)) - (values[a] - np.mean(values))
         assert x["weight"] == pytest.approx(lost, abs=1e-3)
+    weights = [abs(x["weight"]) for x in answer["without"]]
+    assert weights == sorted(weights, reverse=True)
     assert answer["chosen"] == int(np.argmax(answer["before"]))
+
+
+def test_a_reason_says_where_its_trunk_stands(server: Server) -> None:
+    answer = flown(server, "44", more="0")
+    x, y, heading = answer["moments"][2]["pose"]
+    for reason in ask(server, "/why", actions="44", time="2", **FIRST)["without"]:
+        dx, dy = np.subtract(answer["trunks"][reason["trunk"]], (x, y))
+        left = dy * np.cos(heading) - dx * np.sin(heading)
+        side = f"{abs(left):.1f} m {'left' if left > 0 else 'right'}"
+        assert reason["name"] == f"{np.hypot(dx, dy):.0f} m off, {side}"
+
+
+@pytest.mark.parametrize("world", HOMES)
+@pytest.mark.parametrize("time", [0, 2, 20])
+def test_a_look_inside_is_what_the_first_layer_makes_of_the_four_frames(
+    server: Server, world: str, time: int
+) -> None:
+    more, (q, w) = FIRST | {"world": world, "weights": HOMES[world]}, shipped(world)
+    record = flown(server, **more)["record"]
+    answer = ask(server, "/look", actions=record["actions"], time=str(time), **more)
+    s = [drone.observation for drone in refly(record, w)][time]  # (4, 84, 84)
+    maps = torch.relu(q.conv[0](torch.from_numpy(s / 255.0).float())).detach().numpy()
+    shown = [np.frombuffer(b64decode(x), np.uint8).reshape(20, 20) for x in answer["maps"]]
+    assert len(shown) == 32
+    assert np.allclose(shown, 255 * maps / maps.max(), atol=0.51)
 
 
 def test_the_next_step_goes_on_with_one_of_the_last_eight_episodes() -> None:
@@ -383,8 +410,9 @@ def test_a_training_is_found_by_its_name_alone(root: Path) -> None:
 
 
 def test_a_moment_after_the_episode_gets_400(server: Server) -> None:
-    code, text = request(server, "/why", json.dumps(FIRST | {"actions": "44", "time": "3"}))
-    assert (code, text) == (400, "time is 3, and the episode has 2 steps\n")
+    for path in ("/why", "/look"):
+        code, text = request(server, path, json.dumps(FIRST | {"actions": "44", "time": "3"}))
+        assert (code, text) == (400, "time is 3, and the episode has 2 steps\n")
 
 
 def cockpit(*flags: str) -> subprocess.Popen:

@@ -110,9 +110,8 @@ def test_the_network_flies_to_the_end_that_eval_finds(browser: Chrome, host: str
     button(browser, "pilots", "network")
     until(browser, "episode && over() && t === end() && !playing")
     assert value(browser, "episode.record") == episode
-    rows = [row.split() for row in text(browser, "table").splitlines()]
-    assert ["steps", str(episode["steps"])] in rows
-    assert ["return", f"{episode['return']:.1f}"] in rows
+    words = f"after {episode['steps'] / 10} s, return {episode['return']:.1f}"
+    assert text(browser, "table") == f"network {ENDS[episode['outcome']]} {words}"
 
 
 def test_the_arrow_keys_turn_the_drone(browser: Chrome, host: str) -> None:
@@ -213,8 +212,8 @@ def test_a_click_on_a_trunk_takes_it_out_of_the_decision(browser: Chrome, host: 
     with torch.no_grad():
         values = q(torch.from_numpy(s)[None])[0].tolist()
     assert value(browser, "removed.q") == pytest.approx(values, abs=1e-4)
-    bars = browser.find_elements(By.CSS_SELECTOR, "#bars .after")
-    shown = [float(bar.text.replace("\N{MINUS SIGN}", "-")) for bar in reversed(bars)]
+    after = "[...document.querySelectorAll('#bars .after')].map((bar) => bar.textContent)"
+    shown = [float(x.replace("\N{MINUS SIGN}", "-")) for x in reversed(value(browser, after))]
     assert shown == pytest.approx(values, abs=0.051)
     ActionChains(browser).move_to_element(circle).click().perform()
     until(browser, "reasons && !removed")
@@ -222,7 +221,58 @@ def test_a_click_on_a_trunk_takes_it_out_of_the_decision(browser: Chrome, host: 
     until(browser, "removed")
     press(browser, Keys.ESCAPE)
     assert value(browser, "[reasons, removed]") == [None, None]
-    assert not any(bar.text for bar in bars)
+    assert not any(value(browser, after))
+
+
+def seen_inside(browser: Chrome) -> tuple[np.ndarray, np.ndarray]:
+    """What each filter finds at the moment on show: on the page, and as torch computes it, where
+    the greatest value is 255."""
+    until(browser, "!looking && episode.moments[t].maps")
+    script = """[...$("maps").children].map((canvas) => {
+        const copy = new OffscreenCanvas(20, 20).getContext("2d", { willReadFrequently: true });
+        copy.drawImage(canvas, 0, 0);
+        return [...copy.getImageData(0, 0, 20, 20).data].filter((_, i) => i % 4 === 0);
+    })"""
+    shown = np.array(value(browser, script)).reshape(-1, 20, 20)
+    record, t = value(browser, "[episode.record, t]")
+    frames = [drone.observation for drone in refly(record, World())][t]
+    conv = load_weights(ROOT / "weights/dqn.pt")[0].conv[0]
+    with torch.no_grad():
+        maps = torch.relu(conv(torch.from_numpy(frames / 255.0).float()))
+    return shown, (255 * maps / maps.max()).numpy()
+
+
+def test_a_look_inside_shows_what_the_filters_find_at_each_moment_until_escape(
+    browser: Chrome, host: str
+) -> None:
+    visit(browser, host, seed=SEED, pilot="network", t=30)
+    places = """["play", "map", "time", "bars", "look", "why"].map((id) => {
+        const { x, y, width, height } = $(id).getBoundingClientRect();
+        return [id, x, y, width, height];
+    })"""
+    before = value(browser, places)
+    browser.find_element(By.CSS_SELECTOR, "#look canvas:nth-child(2)").click()
+    pictures = []
+    for key in ("", ".", ","):
+        press(browser, key)
+        shown, expected = seen_inside(browser)
+        assert np.allclose(shown, expected, atol=0.51)
+        pictures.append(shown)
+    assert pictures[0].max() == 255
+    assert (pictures[0] == pictures[2]).all()
+    assert (pictures[0] != pictures[1]).any()
+    assert value(browser, places) == before
+    press(browser, Keys.SPACE)
+    until(browser, "t > 33")
+    press(browser, Keys.SPACE)
+    shown, expected = seen_inside(browser)
+    assert np.allclose(shown, expected, atol=0.51), "it follows while the flight plays"
+    press(browser, Keys.ESCAPE)
+    assert not browser.find_element(By.ID, "inside").is_displayed()
+    browser.execute_script("$('look').focus()")
+    for opened in (True, False):
+        press(browser, Keys.ENTER)
+        assert browser.find_element(By.ID, "inside").is_displayed() is opened
 
 
 def test_what_if_flies_both_ways(browser: Chrome, host: str) -> None:
@@ -480,7 +530,7 @@ def test_each_meaning_has_a_colour_of_its_own(browser: Chrome, host: str) -> Non
         value(browser, "whatIf(8)")
         value(browser, "why()")
         colour = "getComputedStyle(document.querySelector('{}')).{}"
-        places = {"#path": "stroke", "#ghost-path": "stroke", ".best i": "backgroundColor",
+        places = {"#path": "stroke", "#ghost-path": "stroke", ".best .own": "fill",
                   "#map .for": "fill", "#map .against": "fill", "#goal": "fill"}  # fmt: skip
         found = [value(browser, colour.format(place, key)) for place, key in places.items()]
         assert len({*found}) == len(found), found
@@ -536,6 +586,31 @@ def test_on_a_phone_frame_map_and_bars_stand_together_and_fingers_steer(host: st
         assert value(phone, "episode.actions").startswith("567888")
         assert seen_whole(phone, "seen", "map", "bars")
         assert value(phone, "scrollY") == 0
+
+
+def tap(phone: Chrome, x: float, y: float) -> None:
+    touch = {"type": "touchStart", "touchPoints": [{"x": x, "y": y}]}
+    phone.execute_cdp_cmd("Input.dispatchTouchEvent", touch)
+    phone.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+
+def test_on_a_phone_a_tap_on_a_frame_opens_the_look_inside_and_another_closes_it(
+    host: str,
+) -> None:
+    with browsing(390, 844, mobile=True) as phone:
+        visit(phone, host, seed=SEED)
+        frame = phone.find_element(By.CSS_SELECTOR, "#look canvas:last-child").rect
+        tap(phone, frame["x"] + 20, frame["y"] + 20)
+        until(phone, "!$('inside').hidden")
+        shown, expected = seen_inside(phone)
+        assert np.allclose(shown, expected, atol=0.51)
+        assert seen_whole(phone, "seen", "look", "maps", "bars")
+        last = "document.querySelector('#maps canvas:last-child').getBoundingClientRect()"
+        edge = "$('place').getBoundingClientRect()"
+        assert value(phone, f"{last}.bottom <= {edge}.bottom && {last}.right <= {edge}.right")
+        assert value(phone, "document.documentElement.scrollWidth") <= 390
+        tap(phone, frame["x"] + 20, frame["y"] + 20)
+        until(phone, "$('inside').hidden")
 
 
 @pytest.mark.parametrize("width", [390, 1280])
@@ -640,10 +715,10 @@ def test_keys_range_buttons_and_curves_go_through_the_training(
     press(browser, Keys.ARROW_LEFT)
     assert_shows(browser, flown[STEPS[0]])
     press(browser, Keys.ARROW_LEFT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)
-    assert value(browser, "[at, $('validation').value]") == [2, "2"]
-    click(browser, "sooner")
+    assert value(browser, "[at, $('time').value]") == [2, "2"]
+    click(browser, "back")
     assert value(browser, "at") == 1
-    browser.find_element(By.ID, "validation").send_keys(Keys.HOME)
+    browser.find_element(By.ID, "time").send_keys(Keys.HOME)
     assert value(browser, "at") == 0
     curve = browser.find_element(By.CSS_SELECTOR, "#progress svg").rect
     x, y = curve["x"] + curve["width"] * 15 / 200, curve["y"] + curve["height"] / 2
@@ -764,6 +839,19 @@ def test_a_chosen_episode_is_flown_as_it_was(
     assert value(browser, "training.name") == "runs/mine"
 
 
+def test_a_recorded_way_without_its_weights_has_no_look_inside(
+    browser: Chrome, school: str, root: Path
+) -> None:
+    for there in (True, False):
+        study(browser, school, step=STEPS[1])
+        value(browser, "flyEpisode(3)")
+        press(browser, Keys.SPACE)
+        assert browser.find_element(By.ID, "look").is_enabled() is there
+        browser.execute_script("actions.look()")
+        assert browser.find_element(By.ID, "inside").is_displayed() is there
+        (root / "runs/mine/best.pt").unlink(missing_ok=True)
+
+
 def test_the_address_restores_training_and_validation_or_the_recorded_episode(
     browser: Chrome, school: str, flown: dict[int, list[Episode]]
 ) -> None:
@@ -815,7 +903,7 @@ def test_a_validation_appears_while_one_looks(
     WebDriverWait(browser, 3, 0.05).until(
         lambda _: value(browser, "training.validations.length === 4")
     )
-    assert value(browser, "[at, $('count').textContent]") == [1, "2 of 4"]
+    assert value(browser, "[at, $('clock').textContent]") == [1, "2 of 4"]
     keep_training(root / "runs/mine", {STEPS[0]: flown[STEPS[0]]})
     until(browser, "training.validations.length === 1")  # it has begun anew
     assert_shows(browser, flown[STEPS[0]])
@@ -860,8 +948,6 @@ def test_a_finger_on_a_phone_flies_an_episode(school: str, flown: dict[int, list
         assert value(phone, "document.documentElement.scrollWidth") <= 390
         assert text(phone, "hint").startswith("Tap a way")
         i, x, y = lone(phone)
-        touch = {"type": "touchStart", "touchPoints": [{"x": x, "y": y}]}
-        phone.execute_cdp_cmd("Input.dispatchTouchEvent", touch)
-        phone.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        tap(phone, x, y)
         until(phone, "!learning() && episode && ghost")
         assert value(phone, "episode.record") == flown[STEPS[1]][i]
