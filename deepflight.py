@@ -25,7 +25,7 @@ A seed is a forest, and there are three sets of them:
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
 A run's folder holds config.json, log.csv, validation.jsonl (one line an episode), checkpoint.pt and
-best.pt: the best weights in validation; in the last tenth of the steps, their mean over that tenth.
+best.pt: the best weights in validation, or after nine tenths of the steps the mean since then.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -99,18 +99,18 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
         + gamma * goal_bonus       0.99 * 125 = 123.75, once      on arrival at the goal
         + gamma * far_bonus        0.99 * 200 = 198, once         on leaving by the far edge
 
-    forward_reward: r pays for being somewhere and not for getting on, so a drone that circles in
+    forward_reward: r pays for where the drone is and not for moving on, so a drone that circles in
     one place earns as much as one that flies past it.
     goal_bonus: arrival ends the episode, and with it all rewards. To stay near the goal for ever
     would earn 1.25 + 0.99 * 1.25 + ... = 1.25 / (1 - 0.99) = 125 at most. So arrival earns as much:
-    1.25 at once, and 125 one step later, where it counts 0.99 times.
+    1.25 + 0.99 * 125 = 125.
     far_bonus: the frames hardly show which edge is the far one, so a drone that leaves is not sure
-    whether it gets -10 or 188. The bonus makes this risk worth it; 200 was found in validation. It
-    changes the task: the paper counts the far edge as a crash, and here it is worth more than
-    arrival. So look at the share that arrived too, and not only at the share that crossed.
+    whether it gets -10 or -10 + 198. The bonus makes this risk worth it; 200 was found in
+    validation. It changes the task: the paper counts the far edge as a crash, and here it is worth
+    more than arrival. So look at the share that arrived too, and not only at that which crossed.
 
-    On purpose, these parts change which way of flying is best. Potential-based ones, gamma * f(s2)
-    - f(s), cancel along a flight, so they would not [Ng 1999]. All printed returns are the paper's.
+    On purpose, these parts change which way of flying is best. Parts of the form gamma * f(s2) -
+    f(s), with f = 0 at the end, would not [Ng 1999]. All printed returns leave the three out.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -136,10 +136,10 @@ class Run:
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log, self.flown = c, folder, [], []
         self.rng = np.random.default_rng(c.seed)
-        self.forest_rng = np.random.default_rng([c.seed, 1])  # its own: exploring shifts no forest
+        self.forest_rng = np.random.default_rng([c.seed, 1])  # or exploring changes the forests
         seeds = (int(self.forest_rng.integers(TRAIN_END)) for _ in count())
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
-        self.loop = c.train(c, self.envs, self.rng, shaped_reward)
+        self.loop = c.train(c, self.envs, self.rng, shaped_reward)  # dqn.train, or a lesson's
         self.agent, self.replay = next(self.loop)
         if saved:
             self.restore(saved)
@@ -173,7 +173,7 @@ class Run:
         mean of the weights is kept whatever its score, because the best of many is partly luck."""
         envs, averaged = self.envs, self.agent.averaged.n_averaged > 0
         q = copy.deepcopy(self.agent.averaged.module if averaged else self.agent.q)
-        q.half().float()  # best.pt keeps half precision: fly that
+        q.half().float()  # in place: rounds the weights as best.pt will
         recent = measure(envs.episodes[-100:] or [drone.episode() for drone in envs.drones])
         flown = fly(dqn_pilot(q), VALIDATION, envs.world)
         self.flown += [json.dumps({"step": envs.steps} | episode) + "\n" for episode in flown]
@@ -196,7 +196,7 @@ class Run:
         print(ROW.format(**row, speed=speed, left=left), flush=True)
 
     def save_checkpoint(self) -> None:
-        """Write the checkpoint, 34 MB. Of the replay it holds the actions, one byte each."""
+        """Write the checkpoint, 34 MB. In place of the replay it holds all actions, a byte each."""
         content = {"config": asdict(self.c), "fingerprint": fingerprint(self.c), "log": self.log,
                    "flown": self.flown, "actions": self.envs.history,
                    "forests": self.forest_rng.bit_generator.state,
@@ -212,14 +212,14 @@ class Run:
             s2, r, terminated, truncated, drones = self.envs.step(actions)
             r = shaped_reward(r, drones, self.c)  # (L,)
             self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
-        if self.forest_rng.bit_generator.state != saved["forests"]:  # fewer or more have begun
+        if self.forest_rng.bit_generator.state != saved["forests"]:  # not as many have begun
             raise InputError(f"{self.folder}: its actions lead to other episodes on this machine")
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state = saved["rng"]
         self.log, self.flown = saved["log"], saved["flown"]
-        if saved["config"]["steps"] != self.c.steps:  # more steps: the last tenth begins later
-            self.agent.averaged.n_averaged.zero_()  # a longer training averages its own last share
+        if saved["config"]["steps"] != self.c.steps:  # more steps: average their own last tenth
+            self.agent.averaged.n_averaged.zero_()
 
 
 def dqn_pilot(q: QNetwork) -> Pilot:
@@ -255,28 +255,28 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
         report = {"weights": args.weights.name, "forests": len(seeds), "first_seed": seeds[0]}
         report["pilots"] = {who: metrics[who] | {"episodes": flown[who]} for who in flown}
         save(args.json, json.dumps(report).encode())
-    shown = flown[name][measure(flown[name])["crossed"].argmax()]  # the first True, or the first
+    shown = flown[name][measure(flown[name])["crossed"].argmax()]  # that crossed, or the first
     save_film(film, shown, world, q, name)
     print(f"\nwrote {film}: forest {shown['seed']}")
     return 0
 
 
 def measure(episodes: list[Episode]) -> dict[str, ndarray]:
-    """One number an episode (F,): steps, progress in m, return, and 0 or 1 for how it ended, where
-    crossed means arrived at the goal, or left by the far edge."""
+    """Arrays (F,), one number for each of F episodes: steps, progress in m, return, and 0 or 1 for
+    each way to end, where crossed means arrived at the goal, or left by the far edge."""
     table = {key: np.array([e[key] for e in episodes]) for key in ("steps", "progress", "return")}
     ended = {key: np.array([e["outcome"] == key for e in episodes]) for key in env.OUTCOMES}
     return table | {"crossed": ended["goal"] | ended["far"]} | ended
 
 
 def summarize(episodes: list[Episode], baseline: list[Episode], forests: int) -> dict[str, dict]:
-    """Every metric with its 95 % interval. Episodes are in the order of `fly`, once or repeatedly.
+    """Every metric with its 95 % interval. episodes, baseline: one round of `fly` or more.
 
     Episodes in the same forest resemble each other, so means are taken over forests. Their interval
     comes from the bootstrap: draw as many forests again, with replacement, 2,000 times, and see how
-    the mean varies. A share has Wilson's interval.
+    the mean varies. A share has Wilson's, because the bootstrap of 0 % would be [0, 0].
     """
-    draws = np.random.default_rng(0).integers(forests, size=(2000, forests))
+    draws = np.random.default_rng(0).integers(forests, size=(2000, forests))  # (2000, forests)
     means = {key: x.reshape(-1, forests).mean(0) for key, x in measure(episodes).items()}
     random_steps = measure(baseline)["steps"].reshape(-1, forests).mean(0)  # (forests,)
     ratios = means["steps"][draws].mean(1) / random_steps[draws].mean(1)  # (2000,) the same forests

@@ -9,7 +9,7 @@ late. Three rewards 1, 1, -10 and then the end: 1 + 0.99 * 1 + 0.99^2 * -10 = -7
 step. An agent that knows Q can act: it takes the action with the highest Q. Here a neural network
 learns Q. It is a function with 1.7 million adjustable numbers, its weights: four frames go in, nine
 numbers come out. For each Q(s, a) it needs a target y. Nobody has the true one. But the return from
-s is r plus gamma times the return from s2, so every transition (s, a, r, s2) makes its own target:
+s is r plus gamma times the best from s2, so every transition (s, a, r, s2) makes its own target:
 
     y = r + gamma * max over a2 of Q(s2, a2)        or y = r, if the world ended the episode
 
@@ -17,8 +17,8 @@ In numbers: r = 0.5, and the greatest of the nine Q(s2, .) is 10. Then y = 0.5 +
 If Q(s, a) is 8, the error is 2.4, and all weights move a little, so that Q(s, a) grows. y is called
 the TD target (temporal difference), and the equation is Bellman's. To make a target from another
 estimate is called bootstrapping. It works because each target holds one true reward, and where a
-crash ends an episode the whole target is true. Take three steps with rewards 0.5, 0.5 and -10, one
-action only, and let all Q be 0 at first. Each update sets all three to their targets:
+crash ends an episode the whole target is true. Take three steps with rewards 0.5, 0.5 and -10, a
+single possible action, and let all Q be 0 at first. Each update sets all three to their targets:
 
                      Q of step 1   step 2   step 3
     after update 1       0.5         0.5     -10
@@ -28,10 +28,10 @@ action only, and let all Q be 0 at first. Each update sets all three to their ta
 The truth moves backwards. Three things can go wrong, and DQN has an answer to each:
   * Steps that follow each other are alike (correlated samples), and a network that learns from them
     in that order forgets the rest. So a **replay** keeps transitions, and each update draws some at
-    random. Older, worse agents flew them, and yet they serve: y asks for the best action
-    in s2 and not for the one that was taken (Q-learning is off-policy; but see `window`).
-  * Each update of Q also moves the targets. So they come from a **target network** Q^, a copy of Q
-    that is synced only now and then.
+    random. Older, worse agents flew them, and yet they serve: y uses the best action in s2,
+    whichever was taken (Q-learning is off-policy; but see `window`).
+  * Each update of Q would also move its own targets, in a chase without end. So they come from a
+    **target network** Q^, a copy of Q that is synced only now and then.
   * An agent that always does what seems best never finds what is better. So it **explores**: with
     probability epsilon, at first 1 and later 0.05, its action is random (an exploration schedule).
 
@@ -47,7 +47,7 @@ DQN for one environment, without what is marked [+] below:
             b = 32 random transitions of the replay
             y = b.r if b.end is TERMINAL else b.r + gamma * max Q^(b.s2, .)
             loss = the mean of (y - Q(b.s, b.a))^2 / 2, linear beyond an error of 1
-            move the weights of Q a little against the gradient of the loss
+            move the weights of Q against the gradient of the loss (see `learn`)
         every 2,000 steps:
             Q^ = Q
 
@@ -100,10 +100,10 @@ class DQNConfig:
     double: bool = setting(True, "[+] Double DQN [van Hasselt 2016]; --no-double: off", 0, 1)
     n_steps: int = setting(5, "[+] true rewards in a target; 1: off", 1, 100)
     mirror: bool = setting(True, "[+] reflect half of every batch; --no-mirror: off", 0, 1)
-    huber_delta: float = setting(10.0, "[+] the hardest pull of a TD error; 1: Mnih's", 1e-3, 1e6)
+    huber_delta: float = setting(10.0, "[+] error where the loss turns linear; Mnih: 1", 1e-3, 1e6)
     lr_final: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
     swa_fraction: float = setting(0.1, "[+] average weights in this last share; 0: off", 0, 0.5)
-    # Half as many bits make convolutions quicker on some processors. A lesson switches it off.
+    # 16 bits in place of 32: quicker convolutions on some processors. A lesson switches it off.
     bfloat16: ClassVar[bool] = bool(torch.cpu.get_capabilities().get("avx512_bf16"))
 
     def __post_init__(self) -> None:
@@ -123,17 +123,21 @@ class QNetwork(nn.Module):
 
     Each number that leaves a layer is a weighted sum of numbers that enter it, plus a constant, its
     bias: inputs 2 and -1, weights 3 and 4 and bias 1 make 3 * 2 + 4 * -1 + 1 = 3. In a linear layer
-    every output sees all inputs. In a convolution it sees a small square, with the same few weights
-    in every place: a filter. A filter of two pixels with weights -1 and 1 makes 0 4 0 of the row
-    5 5 9 9: it finds the edge. Filters of 8x8 pixels that move on by 4 have (84 - 8) / 4 + 1 = 20
-    places in a row of 84. ReLU turns negative numbers into 0; without it, two layers could do no
-    more than one. The last layer has none, because values may be negative.
+    every output sees all inputs. In a convolution it sees a small square of each, with the same
+    weights in every place: a filter. A filter of two pixels with weights -1 and 1 makes 0 4 0 of
+    the row 5 5 9 9: it finds the edge. Filters of 8x8 pixels that move on by 4 have (84 - 8) / 4 +
+    1 = 20 places in a row of 84. ReLU turns negative numbers into 0; without it, two layers could
+    do no more than one. The last layer has none, because values may be negative.
+
+    A Tensor is an ndarray that remembers how it was made, so backward() can find the gradient of
+    every weight (see `learn`). Under no_grad() it forgets. A Module is a function with weights, and
+    state_dict() lists these by name.
     """
 
     def __init__(self, actions: int) -> None:
         super().__init__()
         self.conv = nn.Sequential(
-            nn.Conv2d(4, 32, 8, 4), nn.ReLU(),  # (B, 32, 20, 20): 4 frames, 32 filters of 8x8
+            nn.Conv2d(4, 32, 8, 4), nn.ReLU(),  # (B, 32, 20, 20): 4 frames, 32 filters of 8x8, by 4
             nn.Conv2d(32, 64, 4, 2), nn.ReLU(),  # (B, 64, 9, 9)
             nn.Conv2d(64, 64, 3, 1), nn.ReLU(),  # (B, 64, 7, 7)
             nn.Flatten(),  # (B, 3136)
@@ -153,7 +157,7 @@ class QNetwork(nn.Module):
 
     @torch.no_grad()
     def values(self, s: ndarray, drones: Any) -> ndarray:
-        """Q(s, .) (E, A) of s (E, 4, 84, 84) uint8, for acting; lessons ask the drones for more."""
+        """Q(s, .) (E, A) of s (E, 4, 84, 84) uint8, for acting. drones: for lessons only."""
         return self(torch.from_numpy(s)).numpy()
 
 
@@ -166,7 +170,7 @@ Batch = namedtuple("Batch", "s a r s2 gamma_n end")
 
 
 class Replay:
-    """The last transitions of L environments side by side (line 1 of Algorithm 1, above `train`).
+    """The last transitions of L environments side by side (Algorithm 1, line 1: see `train`).
 
     Each frame is kept once, 7,056 bytes; s and s2 are put together when they are drawn. Keeping
     both whole would cost eight times as much. Row t, environment l holds the newest frame of s_t,
@@ -191,7 +195,7 @@ class Replay:
 
     def __init__(self, capacity: int, num_envs: int) -> None:
         self.rows, self.num_envs = shape = (capacity // num_envs, num_envs)  # T, L
-        self.frames = np.full((*shape, 84, 84), 0, np.uint8)  # (T, L, 84, 84) takes memory at once
+        self.frames = np.full((*shape, 84, 84), 0, np.uint8)  # (T, L, 84, 84) all taken now
         self.actions, self.ends = np.zeros(shape, np.int64), np.zeros(shape, np.uint8)  # (T, L)
         self.rewards = np.zeros(shape, np.float32)  # (T, L)
         self.last_frames: dict[tuple[int, int], ndarray] = {}  # (row, env) -> (84, 84)
@@ -215,9 +219,9 @@ class Replay:
     def sample(self, size: int, n: int, gamma: float, rng: Generator) -> Batch:
         """Draw transitions uniformly.
 
-        The oldest three rows are left out, because the frames before them may be overwritten. The
-        newest n rows are left out, because their s2 is not there yet. In the drawing above, row 7
-        is written next. With n = 2, rows 7, 8 and 9 and rows 5 and 6 are left out.
+        The oldest three rows are left out, because the frames before them are overwritten. The
+        newest n rows are left out, because their s2 is not there yet. In the ring above, row 7 is
+        written next. With n = 2, rows 7, 8 and 9 and rows 5 and 6 are left out.
         """
         oldest = max(self.added - self.rows, 0) + 3
         row = rng.integers(oldest, self.added - n, size) % self.rows  # (B,)
@@ -227,10 +231,10 @@ class Replay:
     def window(self, row: ndarray, env: ndarray, n: int, gamma: float) -> Batch:
         """The transitions from row (B,), env (B,), over n steps or to the end of the episode.
 
-        [+n_steps] With n = 2 the target of Q(s_0, a_0) is r_0 + gamma * r_1 + gamma^2 * (the
+        [+n_steps] With n = 2 the target of Q(s_0, a_0) is r_0 + gamma * r_1 + gamma**2 * (the
         greatest Q^ of s_2): two true rewards, so the truth moves back by two steps in each update.
-        This has a price: r_1 followed from the action in s_1, which an older agent chose. It may
-        have been a worse one than the best, so such a target is often too low.
+        This has a price: r_1 followed from the action in s_1, which an older agent chose, and
+        which was often not the best one. So such a target is often too low.
         """
         rows, envs = (row[:, None] + np.arange(n)) % self.rows, env[:, None]  # (B, n), (B, 1)
         live = self.ends[rows, envs] == LIVE  # (B, n)
@@ -279,11 +283,6 @@ class Agent(nn.Module):
 
     [+swa_fraction] Each update changes how Q flies, for better or worse. The mean of the weights
     over many updates is steadier (stochastic weight averaging), so it is what flies in the end.
-
-    Adam moves each weight by -lr * m / (sqrt(v) + eps). m = 0.9 * m + 0.1 * g is a running mean of
-    its gradient g, and v of g^2, with 0.999 and 0.001 (both corrected for their start at 0). So all
-    weights move about equally fast, but for those with gradients below eps. Rainbow's eps is 1.5e-4
-    [Hessel 2018]. Ours is huber_delta times that, because gradients may be that much larger.
     """
 
     def __init__(self, c: DQNConfig, actions: int, rng: Generator) -> None:
@@ -305,8 +304,8 @@ def td_target(b: Batch, q2: Tensor, q2_online: Tensor) -> Tensor:
     a2 is chosen. In [Mnih15] both are the same, so the value of a2 is the maximum.
 
     [+double] A maximum of noisy values is too high (overestimation bias). Let two actions both be
-    worth 0, and let Q^ err by +1 and -1: the maximum is 1. If Q chooses a2 instead, whose errors
-    differ from those of Q^, it hits +1 and -1 about equally often, which makes 0 on average.
+    worth 0, and let Q^ err by +1 and -1: the maximum is 1. If Q, whose errors are others, chooses
+    a2 instead, it hits +1 and -1 about equally often, which makes 0 on average.
     """
     a2 = q2_online.argmax(1, keepdim=True)  # (B, 1)
     v2 = q2.gather(1, a2)[:, 0]  # (B,) q2[i, a2[i]] of each i
@@ -319,17 +318,18 @@ def learn(agent: Agent, b: Batch, c: DQNConfig) -> None:
     The loss is one number that says how wrong a batch is, and its gradient says for each weight how
     the loss changes if that weight grows. An example with one weight w = 2 and one input x = 4: Q
     is w * x = 8, the target 10.4, and half the error's square 2.88. If w grew by a little d, Q
-    would grow by 4 d and the loss would fall by 2.4 * 4 d = 9.6 d: the gradient is -9.6. With a
-    learning rate of 0.01, w becomes 2 + 0.01 * 9.6 = 2.096, and Q 8.38.
-
-    A Tensor is an ndarray that remembers how it was made, so backward() can find the gradient of
-    every weight, and step() moves the weights. Under no_grad() it forgets, so y is a constant. A
-    Module is a function with weights, and state_dict() lists these by name.
+    would grow by 4 d and the loss would fall by 2.4 * 4 d = 9.6 d: the gradient is -9.6. In plain
+    gradient descent with a learning rate of 0.01, w becomes 2 + 0.01 * 9.6 = 2.096, and Q 8.38.
 
     [+huber_delta] The Huber loss is half the error's square up to delta and a straight line beyond,
     so no error pulls harder than delta. Say that nine targets of ten are 0 and one is -10, a crash.
     Q should be their mean, -1. With Mnih's delta of 1 it comes to rest where nine small pulls
-    balance one pull of 1: 9 * -Q = 1, so Q = -0.11, and the crash is nearly ignored.
+    balance one pull of 1: 9 * (0 - Q) = 1, so Q = -0.11, and the crash is nearly ignored.
+
+    Adam, the optimizer, moves each weight by -lr * m / (sqrt(v) + eps). m = 0.9 * m + 0.1 * g is a
+    running mean of its gradient g, and v of g**2, with 0.999 and 0.001 (both corrected for their
+    start at 0). So all weights move about equally fast, and slower where gradients are below eps:
+    Rainbow's 1.5e-4 [Hessel 2018], times huber_delta, because gradients may be that much larger.
     """
     with torch.no_grad():
         q2 = agent.q_target(b.s2, c.bfloat16)  # (B, A)
@@ -353,8 +353,8 @@ def linear_schedule(step: int, first: float, final: float, steps: int) -> float:
 
 
 def due(every: int, step: int, num_envs: int) -> int:
-    """How many multiples of `every` lie among the num_envs control steps of one pass, of which
-    `step` is the last: 9 to 16 hold two multiples of 4, so two updates are due.
+    """How often something that happens every `every` steps falls in one pass, whose last step is
+    `step`: steps 9 to 16 hold two multiples of 4, so two updates are due.
 
     >>> due(4, 16, 8), due(2_000, 16, 8)
     (2, 0)
@@ -362,7 +362,7 @@ def due(every: int, step: int, num_envs: int) -> int:
     return step // every - (step - num_envs) // every
 
 
-# Algorithm 1 of [Mnih15]; phi(s): the last four frames, theta: the weights.
+# Algorithm 1 of [Mnih15]; `train` has its numbers. phi(s): four frames, theta: weights.
 #      1  initialize replay memory D to capacity N
 #      2  initialize action-value function Q with random weights theta
 #      3  initialize target action-value function Q^ with weights theta- = theta

@@ -8,7 +8,7 @@
                  | o   `~~~~~~> o    o   o    o   o    o    o    |
     right edge   |   o    o   psi  o    o   o    o   o   o     o | o
         y = -25  +-----------------------------------------------+
-               x = 0    x: start to goal, y: left, heading psi: counter-clockwise from x   x = 90
+               x = 0                                                             x = 90
 
 The drone never slows down. Ten times a second it picks one of nine yaw rates, flies 0.5 m, and gets
 a new frame from its camera. Each step earns a reward, which says how good the step was:
@@ -44,9 +44,9 @@ Legend
     d_obs     m, from the drone's centre to the nearest trunk's surface, at most a laser's range
     d_goal    m, from the drone's centre to the goal
     d_max     m, the forest's length
-    psi       the heading in rad
+    psi       the heading in rad, counter-clockwise from x; y points to the left
     N, E      trunks; active drones, which are those whose episodes have not ended
-    [DF]      the paper; "authors' simulator": the code released with it; "ours": from neither
+    [DF]      the Deep Flight paper; "authors' simulator": its code; "ours": from neither
 
 Not in this file: rotors, wind, inertia, a change of altitude.
 """
@@ -109,7 +109,7 @@ def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
 
 
 def plant(seed: int, world: World) -> ndarray:
-    """Trunk centres (N, 2) in m: a jittered grid, a function of the seed alone."""
+    """Trunk centres (N, 2) in m: a jittered grid; the same seed makes the same forest."""
     cells = np.indices(world.grid).reshape(2, -1).T  # (N, 2): 0 0, 0 1, ... 14 9
     jitter = np.random.default_rng(seed).uniform(-1, 1, cells.shape)  # (N, 2)
     return world.first + cells * world.spacing + jitter * world.jitter
@@ -127,7 +127,7 @@ class Drone:
     """
 
     def __init__(self, world: World) -> None:
-        self.world, self.outcome = world, "not reset"  # anything but "": no episode is active
+        self.world, self.outcome = world, "not reset"  # not "", so reset_done begins here
         self.space, self.body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         fixed, count = self.space.static_body, math.prod(world.grid)
         self.shapes = [pymunk.Circle(fixed, world.trunk_radius) for _ in range(count)]
@@ -154,7 +154,7 @@ class Drone:
             raise ValueError(f"no action {action}, or the episode is over: {self.outcome!r}")
         self.actions.append(int(action))
         yaw_rate = world.yaw_rate * (2 * action / (world.num_actions - 1) - 1)  # rad/s
-        heading = self.body.angle + yaw_rate * world.dt  # rad, after this turn
+        heading = self.body.angle + yaw_rate * world.dt  # rad: it turns first, then flies
         self.body.velocity = world.speed * math.cos(heading), world.speed * math.sin(heading)
         self.body.angular_velocity = yaw_rate
         self.space.step(world.dt)  # pymunk moves the drone for dt seconds
@@ -203,7 +203,7 @@ class VecForest:
         self.world, self.num_actions = world, world.num_actions
         self.drones, self.seeds = [Drone(world) for _ in range(num_envs)], iter(seeds)
         self.episodes: list[Episode] = []  # all that have ended
-        self.history: list[bytes] = []  # all actions; deepflight.Run can fly them again
+        self.history: list[bytes] = []  # all actions, from which deepflight.Run resumes
         self.steps = 0  # control steps of all drones together
 
     @property

@@ -1,7 +1,7 @@
 r"""render.py: the camera. It turns a forest of upright cylinders into a grey frame of 84x84 pixels.
 
-Every trunk is upright, so each column of the frame is one ray in the ground plane, and no 3D engine
-is needed. A camera is 84 rays.
+All trunks are upright and equally tall, so in each column of the frame the nearest one hides the
+others. One ray in the ground plane finds it. A camera is 84 rays, and no 3D engine is needed.
 
     seen from above                              the same trunk in the frame
 
@@ -23,7 +23,7 @@ Where does a ray meet a trunk?
                  \         /         half_chord  from the surface # to p
                   `-.....-'          radius      from the surface # to c
 
-    half_chord = sqrt(radius^2 - across^2)      by Pythagoras, if across < radius
+    half_chord = sqrt(radius^2 - across^2)      by Pythagoras, if abs(across) < radius
     distance   = along - half_chord             from the camera to the surface
     cosine     = half_chord / radius            of the angle of incidence, at #: 1 where the ray
                                                 meets it head-on, 0 where it grazes it
@@ -32,14 +32,14 @@ One ray in numbers: a trunk of radius 0.5 m stands 10 m ahead and 0.3 m to the l
 straight ahead along = 10, across = 0.3, half_chord = 0.4, distance = 9.6 and cosine = 0.8.
 
 A pinhole camera has two rules:
-  * Column i looks along tan(bearing) = (41.5 - i) / 42, positive to the left. The columns are
-    equally spaced on the image plane, and not in angle.
+  * Column i looks to the left by a bearing with tan(bearing) = (41.5 - i) / 42. So the columns are
+    equally spaced on the flat image, and not in angle.
   * Row i, at depth z, looks at a point (41.5 - i) / 42 * z metres above the camera. Depth is
-    the distance straight ahead. With distance along the ray, a wall's straight top would look bent.
+    measured straight ahead. With the distance along the ray, a wall's straight top would bend.
 The trunk of the example is 9.6 m away. Its top is 4 m higher than the camera, its foot 2 m lower,
 so it fills the rows from 41.5 - 42 * 4 / 9.6 = 24.0 to 41.5 + 42 * 2 / 9.6 = 50.25.
 
-The disparity camera draws the same outlines, but a pixel says how near its point is, whatever its
+The grey camera shows how bright a point is, the disparity camera how near it is, whatever its
 colour and the light. So a pilot that learns from disparity in one forest should fly in forests that
 look different [DF §IV].
 
@@ -62,11 +62,11 @@ from numpy import ndarray
 from PIL import Image, ImageDraw
 
 PIXELS = 84  # height and width of a frame [DF §II-A]
-# (84,) (41.5 - i) / 42 of column i, to the left, or of row i, up: 45 degrees to each side (ours).
+# (84,) the slope of column i to the left, or of row i upwards; 45 degrees to each side (ours).
 SLOPES = ((PIXELS - 1) / 2 - np.arange(PIXELS)) / (PIXELS / 2)
 BEARINGS = np.arctan(SLOPES)  # (84,) rad, counter-clockwise from straight ahead
 COSINES = np.cos(BEARINGS)  # (84,) depth for each metre along a ray
-CAMERAS = ("grey", "disparity")  # what a pixel may say
+CAMERAS = ("grey", "disparity")  # the two kinds
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Scene:
     trunk_radius: float = 0.5  # m, authors' simulator
     trunk_height: float = 6.0  # m, authors' simulator
     altitude: float = 2.0  # m, of the camera, authors' simulator
-    view: float = 40.0  # m, how far the camera sees; this and all below are ours
+    view: float = 40.0  # m, how far the camera sees; ours, as all below but the length
     length: float = 90.0  # m, x of the goal, which stands at y = 0 on the far edge [DF §II-A]
     beacon: bool = False  # a pole that makes the goal visible; off in the paper's world
     beacon_height: float = 20.0  # m
@@ -108,17 +108,17 @@ def raycast(centres: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray
     half_chord = np.sqrt(np.where(hit, radius**2 - across**2, 0.0))  # (N, M) m
     distance = np.where(hit, along - half_chord, np.inf)  # (N, M) m
     nearest = distance.min(0, initial=np.inf)  # (M,) m
-    half_chord[distance > nearest] = 0.0  # keep the nearest trunk's: max finds it
+    half_chord[distance > nearest] = 0.0  # only the nearest trunk's is left for max
     return nearest, half_chord.max(0, initial=0.0) / radius
 
 
 def shade(grey: ndarray | float, air: ndarray | float, depth: ndarray, scene: Scene) -> ndarray:
-    """The value of a pixel, 0 to 255. depth: m, of what it shows.
+    """The value, 0 to 255, of a pixel that shows a surface of this grey level, depth m ahead.
 
-    air: m of air before it, or 0 for the beacon, which always looks clear. The grey camera mixes a
-    grey level with the sky's: the more air, the more sky, and nothing else where the view ends. A
+    air: m of air before it, or 0 for the beacon, which always looks clear. The grey camera mixes
+    the grey level with the sky's: the more air, the more sky, and only sky where the view ends. A
     stereo camera has two lenses, a baseline apart, which see a point in columns that differ by
-    focal length * baseline / depth: the disparity. 255 * near stands for focal length * baseline.
+    focal length * baseline / depth: the disparity. 255 * near is our focal length * baseline.
 
     >>> shade(0, 0, np.array([1.0, 2.0, 4.0, np.inf]), Scene(camera="disparity"))
     array([255. , 255. , 127.5,   0. ])
@@ -130,14 +130,14 @@ def shade(grey: ndarray | float, air: ndarray | float, depth: ndarray, scene: Sc
 
 @cache
 def background(scene: Scene) -> ndarray:
-    """The column (84, 1) uint8 behind all trunks: sky, and ground, whose air is taken as its depth.
-    A row of slope -t meets the ground at depth altitude / t."""
+    """The column (84, 1) uint8 behind all trunks: sky, and ground, where depth stands in for air. A
+    row of slope -t meets the ground at depth altitude / t."""
     depth = np.where(SLOPES < 0, scene.altitude / np.abs(SLOPES), np.inf)[:, None]  # (84, 1) m
     return shade(scene.ground, depth, depth, scene).astype(np.uint8)
 
 
 def paint(frame: ndarray, depth: ndarray, height: float, value: ndarray, scene: Scene) -> ndarray:
-    """The frame, a column (84, 1) or (84, 84), with upright cylinders drawn over it: (84, 84).
+    """Draw upright cylinders over a frame (84, 84) or a column (84, 1); returns (84, 84).
     depth (84,): m, of their surface, inf where there is none. value (84,): of their pixels."""
     foot, top = -scene.altitude / depth, (height - scene.altitude) / depth  # (84,) slopes, 0 at inf
     inside = (SLOPES[:, None] > foot) & (SLOPES[:, None] <= top)  # (84, 84)
@@ -154,7 +154,7 @@ def draw_frame(pose: Sequence[float], trunks: ndarray, scene: Scene) -> ndarray:
     # Keep what may be in view: between the frame's edges at 45 degrees, and a trunk's width beyond.
     seen = seen[(ahead < scene.view) & (np.abs(left) < ahead + 2 * scene.trunk_radius)]  # (N, 2) m
     distance, cosine = raycast(seen, scene.trunk_radius, BEARINGS)  # (84,) m, (84,)
-    depth = distance * COSINES  # (84,) m, along the optical axis
+    depth = distance * COSINES  # (84,) m, straight ahead
     if scene.beacon:  # visible from any distance
         goal = seen_from(pose, np.array([[scene.length, 0.0]]))  # (1, 2) m
         radius = max(scene.beacon_radius, scene.beacon_pixels / PIXELS * goal[0, 0])  # m
