@@ -1,10 +1,9 @@
-"""Draws figures/cockpit.png: the cockpit at three moments, and how quick it is.
+"""Draws figures/cockpit.png, and measures how quick the cockpit is.
 
     extras/.venv/bin/python -m extras.experiments.cockpit_pictures
 
-Needs Debian's packages chromium and chromium-driver; the page itself does not. The three moments:
-an episode by hand has ended beside the network's; why the network would have turned, without one
-trunk; what if it had turned the other way. Then prints the milliseconds from a step's begin to its
+Needs Debian's packages chromium and chromium-driver; the page itself does not. The picture: a
+flight of the network, and why it turns. Then it prints the milliseconds from a step's begin to its
 frame, and from the question why to the answer. Takes half a minute.
 """
 
@@ -87,20 +86,12 @@ def visit(browser: webdriver.Chrome, host: str, **episode: object) -> None:
     until(browser, "episode && (byHand() || over()) && (ghost || chosen.pilot === 'network')")
 
 
-def moments(browser: webdriver.Chrome, host: str) -> Iterator[bytes]:
-    """The three pictures of the README."""
-    visit(browser, host, seed=1, actions=HAND, t=len(HAND))
-    yield browser.get_screenshot_as_png()
-    visit(browser, host, seed=1, actions=HAND, t=7)
+def picture(browser: webdriver.Chrome, host: str) -> bytes:
+    """The network's flight through forest 7, and why it turns as it does."""
+    visit(browser, host, seed=7, pilot="network", t=40)
     value(browser, "actions.why()")
     until(browser, "reasons")
-    value(browser, "why([...reasons.without].sort((a, b) => b.weight - a.weight)[0].trunk)")
-    until(browser, "removed")
-    yield browser.get_screenshot_as_png()
-    visit(browser, host, seed=7, pilot="network", t=14)
-    value(browser, "whatIf(8)")
-    until(browser, "ghost")
-    yield browser.get_screenshot_as_png()
+    return browser.get_screenshot_as_png()
 
 
 def latencies(browser: webdriver.Chrome, host: str) -> dict[str, list[float]]:
@@ -128,15 +119,10 @@ def latencies(browser: webdriver.Chrome, host: str) -> dict[str, list[float]]:
 
 def main() -> None:
     """Draw the figure, and print the milliseconds."""
-    with serving() as host, browsing() as browser:
-        pictures = [Image.open(BytesIO(png)).convert("RGB") for png in moments(browser, host)]
+    with serving() as host, browsing(1000, 1020) as browser:
+        image = Image.open(BytesIO(picture(browser, host))).convert("RGB")
         times = latencies(browser, host)
-    width, height = pictures[0].size
-    strip = Image.new("RGB", (width * len(pictures), height))
-    for i, picture in enumerate(pictures):
-        strip.paste(picture, (i * width, 0))
-    small = strip.resize((strip.width // 2, height // 2), Image.Resampling.LANCZOS)
-    small.save(ROOT / "figures/cockpit.png", optimize=True)
+    image.quantize(128).save(ROOT / "figures/cockpit.png", optimize=True)
     for name, x in times.items():
         middle, late = np.percentile(x, [50, 95])
         print(f"{name}: {len(x)} times, 50 % within {middle:.1f} ms, 95 % within {late:.1f} ms")
