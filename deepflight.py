@@ -47,7 +47,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, fields
-from itertools import count
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -58,34 +58,32 @@ except ModuleNotFoundError as error:
     sys.exit(f"deepflight.py: {error}; set up .venv as README.md says, and use its Python")
 from numpy import ndarray
 
-import dqn
-import env
-import render
-from dqn import InputError, QNetwork, setting
-from env import Drone, Episode, Pilot, VecForest, World, fly
+from dqn import DQNConfig, InputError, QNetwork, due, setting, train
+from env import OUTCOMES, Drone, Pilot, VecForest, World, fly, random_pilot, refly, straight_pilot
+from render import draw_panel
 
 TRAIN_END, TEST_FIRST = 10**9, 4 * 10**9  # seeds of forests
 VALIDATION = range(10**9, 10**9 + 48)
 
 
 @dataclass(frozen=True)
-class Config(dqn.DQNConfig):
+class Config(DQNConfig):
     """All settings; each is a flag of `train`. [+] as in dqn.py: not in [Mnih15]."""
 
-    seed: int = setting(0, "of everything random", 0, 10**15)
+    seed: int = setting(0, "of everything random", 0, 10**18)
     beacon: bool = setting(False, "[+] put a visible pole at the goal", 0, 1)
-    camera: str = setting("grey", "what a pixel says", *render.CAMERAS)
+    camera: str = setting("grey", "what a pixel says", "grey", "disparity")
     threads: int = setting(1, "of the CPU; another number changes the last digits", 1, 64)
     forward_reward: float = setting(2.0, "[+] for each metre forward; 0: off", 0, 1e3)
     goal_bonus: float = setting(125.0, "[+] for arrival at the goal; 0: off", 0, 1e6)
     far_bonus: float = setting(200.0, "[+] for leaving by the far edge; 0: off", 0, 1e6)
 
     # Skip at first: no settings, but a lesson in extras/ may replace them.
-    train: ClassVar[Callable] = staticmethod(dqn.train)
+    train: ClassVar[Callable] = staticmethod(train)
     network: ClassVar[type] = QNetwork
     pilot: ClassVar[str] = "dqn"  # what the trained network is called
     program: ClassVar[str] = f'"{__file__}"'  # what Python is told to run
-    baselines: ClassVar[dict[str, Pilot]] = {"straight": env.straight_pilot}
+    baselines: ClassVar[dict[str, Pilot]] = {"straight": straight_pilot}
     validate_every: ClassVar[int] = 5_000  # control steps
     # With the beacon the goal can be seen, so arrival should be worth more than the far edge.
     beacon_recipe: ClassVar[dict] = {"steps": 400_000, "forward_reward": 0.0, "far_bonus": 50.0}
@@ -122,7 +120,7 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
 # -------------------------------------------------- train: what stands around the loop of dqn.py
 
 HEAD = "     step  eps   /s   min  return | return length  cross  crash"
-ROW = "{step:9,} {epsilon:4.2f} {speed:4.0f} {left:5.0f} {train_return:7.1f} |"
+ROW = "{step:9,} {epsilon:4.2f} {speed:4.0f} {minutes:5.0f} {train_return:7.1f} |"
 ROW += "{validation_return:7.1f} {validation_steps:6.0f} {validation_crossed:6.0%}"
 ROW += " {validation_crash:6.0%}"
 
@@ -134,10 +132,10 @@ class Run:
         """saved: the checkpoint of a training to go on with."""
         torch.set_num_threads(c.threads)
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
-        self.c, self.folder, self.log, self.flown = c, folder, [], []
+        self.c, self.folder, self.log, self.validations = c, folder, [], []
         self.rng = np.random.default_rng(c.seed)
         self.forest_rng = np.random.default_rng([c.seed, 1])  # or exploring changes the forests
-        seeds = (int(self.forest_rng.integers(TRAIN_END)) for _ in count())
+        seeds = iter(lambda: int(self.forest_rng.integers(TRAIN_END)), None)  # without end
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)  # dqn.train, or a lesson's
         self.agent, self.replay = next(self.loop)
@@ -147,7 +145,8 @@ class Run:
     def go(self) -> int:
         """Train, validate, log and save, until the last step or a signal; returns the exit code."""
         envs, c = self.envs, self.c
-        began = time.perf_counter() - (self.log[-1]["seconds"] if self.log else 0)
+        seconds = self.log[-1]["seconds"] if self.log else 0.0
+        began, self.lap = time.perf_counter() - seconds, (envs.steps, seconds)
         self.folder.mkdir(parents=True, exist_ok=True)
         save(self.folder / "config.json", json.dumps(asdict(c), indent=2).encode())
         again = f'"{sys.executable}" {c.program}'
@@ -157,7 +156,7 @@ class Run:
             for _ in self.loop:
                 if not np.isfinite(self.agent.loss):
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")
-                if dqn.due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
+                if due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
                     self.validate(time.perf_counter() - began)
                 if stopped and envs.steps < c.steps:
                     self.save_checkpoint()
@@ -172,16 +171,16 @@ class Run:
         of the best score: the share that crossed (with the beacon: arrived), then the progress. The
         mean of the weights is kept whatever its score, because the best of many is partly luck."""
         envs, averaged = self.envs, self.agent.averaged.n_averaged > 0
-        q = copy.deepcopy(self.agent.averaged.module if averaged else self.agent.q)
-        q.half().float()  # in place: rounds the weights as best.pt will
+        # best.pt keeps half precision, so fly what it will hold.
+        q = copy.deepcopy(self.agent.averaged.module if averaged else self.agent.q).half().float()
         recent = measure(envs.episodes[-100:] or [drone.episode() for drone in envs.drones])
-        flown = fly(dqn_pilot(q), VALIDATION, envs.world)
-        self.flown += [json.dumps({"step": envs.steps} | episode) + "\n" for episode in flown]
+        episodes = fly(dqn_pilot(q), VALIDATION, envs.world)
+        self.validations += [json.dumps({"step": envs.steps} | e) + "\n" for e in episodes]
         row = {"step": envs.steps, "episodes": len(envs.episodes), "epsilon": self.agent.epsilon}
         row |= {f"train_{key}": float(x.mean()) for key, x in recent.items()}
-        row |= {f"validation_{key}": float(x.mean()) for key, x in measure(flown).items()}
-        last = self.log[-1] if self.log else {"step": 0, "seconds": 0.0}
-        speed = (envs.steps - last["step"]) / (seconds - last["seconds"])  # steps a second
+        row |= {f"validation_{key}": float(x.mean()) for key, x in measure(episodes).items()}
+        speed = (envs.steps - self.lap[0]) / (seconds - self.lap[1])  # steps a second
+        self.lap = envs.steps, seconds
         self.log.append(row | {"seconds": seconds})
         share = "validation_goal" if self.c.beacon else "validation_crossed"
         scores = [(row[share], row["validation_progress"]) for row in self.log]
@@ -190,15 +189,15 @@ class Run:
         lines = [self.log[0].keys(), *(row.values() for row in self.log)]
         text = "".join(",".join(map(str, line)) + "\n" for line in lines)
         save(self.folder / "log.csv", text.encode())
-        save(self.folder / "validation.jsonl", "".join(self.flown).encode())
+        save(self.folder / "validation.jsonl", "".join(self.validations).encode())
         self.save_checkpoint()
-        left = max(self.c.steps - envs.steps, 0) / speed / 60  # min
-        print(ROW.format(**row, speed=speed, left=left), flush=True)
+        minutes = max(self.c.steps - envs.steps, 0) / speed / 60  # that are left
+        print(ROW.format(**row, speed=speed, minutes=minutes), flush=True)
 
     def save_checkpoint(self) -> None:
         """Write the checkpoint, 34 MB. In place of the replay it holds all actions, a byte each."""
         content = {"config": asdict(self.c), "fingerprint": fingerprint(self.c), "log": self.log,
-                   "flown": self.flown, "actions": self.envs.history,
+                   "validations": self.validations, "actions": self.envs.history,
                    "forests": self.forest_rng.bit_generator.state,
                    "rng": self.rng.bit_generator.state, "agent": self.agent.state_dict(),
                    "optimizer": self.agent.optimizer.state_dict()}  # fmt: skip
@@ -217,7 +216,7 @@ class Run:
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state = saved["rng"]
-        self.log, self.flown = saved["log"], saved["flown"]
+        self.log, self.validations = saved["log"], saved["validations"]
         if saved["config"]["steps"] != self.c.steps:  # more steps: average their own last tenth
             self.agent.averaged.n_averaged.zero_()
 
@@ -227,17 +226,11 @@ def dqn_pilot(q: QNetwork) -> Pilot:
     return lambda s, envs: q.values(s, envs.active).argmax(1)
 
 
-def fly_random(seeds: Sequence[int], world: World) -> list[Episode]:
-    """The baseline: 2,000 random episodes or more, because they vary so much in length."""
-    pilot, repeats = env.random_pilot(np.random.default_rng(0)), -(-2000 // len(seeds))
-    return [episode for _ in range(repeats) for episode in fly(pilot, seeds, world)]
-
-
 def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
     """Fly a network and other pilots through the same forests: a table, JSON, and a film."""
     q, world, name = load_weights(args.weights, config.network)
     seeds = range(args.first_seed, args.first_seed + args.episodes)
-    film = args.out / f"{args.weights.stem}.gif"
+    film = args.out / f"{args.weights.resolve().name.removesuffix('.pt')}.gif"
     if not (0 < args.episodes <= 10**5 and args.first_seed >= 0 and 0 < args.threads <= 64):
         raise InputError("allowed: episodes 1 to 10^5, first-seed 0 or more, threads 1 to 64")
     for path in {film, args.json or film}:  # better to fail now than after all episodes
@@ -245,11 +238,11 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
         path.open("ab").close()
     torch.set_num_threads(args.threads)
     print(f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n", flush=True)
-    flown = {"random": fly_random(seeds, world)}
-    for who, pilot in (config.baselines | {name: dqn_pilot(q)}).items():
+    flown, random = {}, {"random": random_pilot(np.random.default_rng(0))}
+    for who, pilot in (random | config.baselines | {name: dqn_pilot(q)}).items():
         print(f"flying {who}", file=sys.stderr)
         flown[who] = fly(pilot, seeds, world)
-    metrics = {who: summarize(flown[who], flown["random"], len(seeds)) for who in flown}
+    metrics = {who: summarize(flown[who], flown["random"]) for who in flown}
     print_table(metrics)
     if args.json:
         report = {"weights": args.weights.name, "forests": len(seeds), "first_seed": seeds[0]}
@@ -261,29 +254,28 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
     return 0
 
 
-def measure(episodes: list[Episode]) -> dict[str, ndarray]:
+def measure(episodes: list[dict]) -> dict[str, ndarray]:
     """Arrays (F,), one number for each of F episodes: steps, progress in m, return, and 0 or 1 for
     each way to end, where crossed means arrived at the goal, or left by the far edge."""
     table = {key: np.array([e[key] for e in episodes]) for key in ("steps", "progress", "return")}
-    ended = {key: np.array([e["outcome"] == key for e in episodes]) for key in env.OUTCOMES}
+    ended = {key: np.array([e["outcome"] == key for e in episodes]) for key in OUTCOMES}
     return table | {"crossed": ended["goal"] | ended["far"]} | ended
 
 
-def summarize(episodes: list[Episode], baseline: list[Episode], forests: int) -> dict[str, dict]:
-    """Every metric with its 95 % interval. episodes, baseline: one round of `fly` or more.
+def summarize(episodes: list[dict], baseline: list[dict]) -> dict[str, dict]:
+    """Every metric with its 95 % interval. baseline: random episodes through the same F forests.
 
-    Episodes in the same forest resemble each other, so means are taken over forests. Their interval
-    comes from the bootstrap: draw as many forests again, with replacement, 2,000 times, and see how
-    the mean varies. A share has Wilson's, because the bootstrap of 0 % would be [0, 0].
+    The interval of a mean comes from the bootstrap: draw as many forests again, with replacement,
+    2,000 times, and see how the mean varies. A share has Wilson's, because the bootstrap of 0 %
+    would be [0, 0].
     """
-    draws = np.random.default_rng(0).integers(forests, size=(2000, forests))  # (2000, forests)
-    means = {key: x.reshape(-1, forests).mean(0) for key, x in measure(episodes).items()}
-    random_steps = measure(baseline)["steps"].reshape(-1, forests).mean(0)  # (forests,)
-    ratios = means["steps"][draws].mean(1) / random_steps[draws].mean(1)  # (2000,) the same forests
-    metrics = {"longer": interval(means["steps"].mean() / random_steps.mean() - 1, ratios - 1)}
-    for key, x in means.items():
-        share = key in ("crossed", *env.OUTCOMES)
-        metrics[key] = wilson(x.mean(), forests) if share else interval(x.mean(), x[draws].mean(1))
+    n, table, random = len(episodes), measure(episodes), measure(baseline)["steps"]
+    draws = np.random.default_rng(0).integers(n, size=(2000, n))  # (2000, F)
+    ratios = table["steps"][draws].mean(1) / random[draws].mean(1)  # (2000,) the same forests
+    metrics = {"longer": interval(table["steps"].mean() / random.mean() - 1, ratios - 1)}
+    for key, x in table.items():
+        share = x.dtype == bool
+        metrics[key] = wilson(x.mean(), n) if share else interval(x.mean(), x[draws].mean(1))
     return metrics
 
 
@@ -317,15 +309,16 @@ def print_table(metrics: dict[str, dict]) -> None:
         print(f"{label:14}" + "".join(f" {f'{x} [{low}, {high}]':>16}" for x, low, high in cells))
 
 
-def save_film(path: Path, episode: Episode, world: World, q: QNetwork, name: str) -> None:
+def save_film(path: Path, episode: dict, world: World, q: QNetwork, name: str) -> None:
     """Write an endless GIF of an episode: frame, path, and what the network says of each action."""
     places, images = [], []
-    for t, drone in enumerate(env.refly(episode, world)):
+    for t, drone in enumerate(refly(episode, world)):
         places.append(drone.pose[:2])
         values = q.values(drone.observation[None], [drone])[0]  # (A,)
         text = f"{name}: {t * world.dt:.1f} s, {drone.d_goal:.1f} m to the goal\n"
-        text += f"reward so far {drone.episode_return:.1f}   {drone.outcome}"
-        images.append(render.draw_panel(drone, np.array(places), values, text))
+        text += f"return {drone.episode_return:.1f}   {drone.outcome and 'end: ' + drone.outcome}"
+        images.append(draw_panel(drone, np.array(places), values, text))
+    images += 20 * images[-1:]  # the end stays in view
     images[0].save(path, save_all=True, append_images=images[1:], duration=1000 * world.dt, loop=0)
 
 
@@ -350,7 +343,7 @@ def load(path: Path | str, *keys: str) -> dict[str, Any]:
     """Read what save wrote, without running any code from the file. InputError if it cannot be
     read, is damaged, or does not hold these keys."""
     try:
-        archive = zipfile.ZipFile(path)  # its checksums leave out the flags, 0 in torch's
+        archive = zipfile.ZipFile(path)  # its checksums leave out the flags, which are 0 in torch's
         if archive.testzip() or any(part.external_attr for part in archive.infolist()):
             raise zipfile.BadZipFile
         content = torch.load(path, weights_only=True)
@@ -396,6 +389,12 @@ def stop_signals() -> Iterator[list[int]]:
         yield stopped
 
 
+def whole(text: str) -> int:
+    """The whole number that a user typed, maybe as 1e6; ValueError if it is none."""
+    number = Fraction(text)
+    return number.numerator if number.denominator == 1 else int(text)
+
+
 def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespace:
     """Read the command line; every setting is a flag of `train`."""
     common = {"prog": "deepflight.py", "usage": argparse.SUPPRESS}  # so an error is a single line
@@ -408,7 +407,7 @@ def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespac
     sub.add_argument("--resume", type=Path, help="folder of a training to go on with")
     group = sub.add_argument_group("settings; [+] marks what [Mnih15] does not have")
     for f in fields(config):
-        more = {"type": float if f.type is int else f.type, "metavar": ""}  # 1e6 steps are allowed
+        more = {"type": whole if f.type is int else f.type, "metavar": ""}
         more |= {"choices": f.metadata["legal"] or None} if f.type is str else {}
         more = {"action": argparse.BooleanOptionalAction} if f.type is bool else more
         text = f"{f.metadata['help']} (default: {f.default})"
@@ -416,19 +415,19 @@ def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespac
     sub = commands.add_parser("eval", help="fly trained weights beside other pilots", **common)
     shipped = Path(__file__).parent / "weights/dqn.pt"
     sub.add_argument("--weights", type=Path, default=shipped, help="a file, or a run's folder")
-    sub.add_argument("--episodes", type=int, default=100, help="one a forest (default: 100)")
-    sub.add_argument("--first-seed", type=int, default=TEST_FIRST, help="(default: %(default)s)")
+    sub.add_argument("--episodes", type=whole, default=100, help="one a forest (default: 100)")
+    sub.add_argument("--first-seed", type=whole, default=TEST_FIRST, help="(default: %(default)s)")
     sub.add_argument("--json", type=Path, help="write every metric and episode to this file")
     sub.add_argument("--out", type=Path, default="runs/eval", help="folder of the film")
-    sub.add_argument("--threads", type=int, default=Config.threads, help="of the CPU")
+    sub.add_argument("--threads", type=whole, default=Config.threads, help="of the CPU")
     return parser.parse_args(argv)
 
 
 def make_run(args: argparse.Namespace, config: type[Config]) -> Run:
     """A new training, or one to go on with."""
-    given = {f.name: f.type(x) for f in fields(config) if (x := getattr(args, f.name)) is not None}
+    given = {f.name: x for f in fields(config) if (x := getattr(args, f.name)) is not None}
     if not args.resume:
-        free = (f"{i:03d}" for i in count(1) if not Path(f"runs/{i:03d}").exists())
+        free = (f"{i:03d}" for i in range(1, 10**9) if not Path(f"runs/{i:03d}").exists())
         folder = Path("runs", args.name or next(free))
         if folder.exists():
             raise InputError(f"{folder} exists: give another --name, or go on with --resume")
@@ -436,7 +435,7 @@ def make_run(args: argparse.Namespace, config: type[Config]) -> Run:
         return Run(config(**recipe | given), folder)
     if args.name or given.keys() - {"steps"}:
         raise InputError(f"{args.resume} keeps its settings: only --steps may be given")
-    keys = "config fingerprint log flown actions forests rng agent optimizer"
+    keys = "config fingerprint log validations actions forests rng agent optimizer"
     saved = load(args.resume / "checkpoint.pt", *keys.split())
     if (made_by := saved["fingerprint"]) != (here := fingerprint(config)):
         raise InputError(f"{args.resume} was made by {made_by}, and here is {here}")

@@ -27,8 +27,8 @@ single possible action, and let all Q be 0 at first. Each update sets all three 
 
 The truth moves backwards. Three things can go wrong, and DQN has an answer to each:
   * Steps that follow each other are alike (correlated samples), and a network that learns from them
-    in that order forgets the rest. So a **replay** keeps transitions, and each update draws some at
-    random. Older, worse agents flew them, and yet they serve: y uses the best action in s2,
+    in that order forgets the rest. So a **replay** buffer keeps transitions, and each update draws
+    some at random. Older, worse agents flew them, and yet they serve: y uses the best action in s2,
     whichever was taken (Q-learning is off-policy; but see `window`).
   * Each update of Q would also move its own targets, in a chase without end. So they come from a
     **target network** Q^, a copy of Q that is synced only now and then.
@@ -66,7 +66,6 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy import ndarray
-from numpy.random import Generator
 from torch import Tensor, nn
 
 # How a transition ended: not at all, by the time limit, or in the world itself (env.py tells more).
@@ -98,7 +97,7 @@ class DQNConfig:
     lr: float = setting(2.5e-4, "learning rate of Adam [Mnih15: of RMSprop]", 1e-9, 1)
     num_envs: int = setting(8, "[+] environments side by side; 1: off", 1, 1000)
     double: bool = setting(True, "[+] Double DQN [van Hasselt 2016]; --no-double: off", 0, 1)
-    n_steps: int = setting(5, "[+] true rewards in a target; 1: off", 1, 100)
+    n_steps: int = setting(5, "[+] rewards in a target: n-step returns; 1: off", 1, 100)
     mirror: bool = setting(True, "[+] reflect half of every batch; --no-mirror: off", 0, 1)
     huber_delta: float = setting(10.0, "[+] error where the loss turns linear; Mnih: 1", 1e-3, 1e6)
     lr_final: float = setting(0.1, "[+] share of lr left in the end; 1: off", 0, 1)
@@ -216,7 +215,7 @@ class Replay:
             self.last_frames[row, env] = s2[env, -1].copy()
         self.added += 1
 
-    def sample(self, size: int, n: int, gamma: float, rng: Generator) -> Batch:
+    def sample(self, size: int, n: int, gamma: float, rng: np.random.Generator) -> Batch:
         """Draw transitions uniformly.
 
         The oldest three rows are left out, because the frames before them are overwritten. The
@@ -240,8 +239,7 @@ class Replay:
         live = self.ends[rows, envs] == LIVE  # (B, n)
         # reached: 1 up to the step that ends the episode, then 0. In the example of the class, row
         # 1 with n = 3: live 1 0 1, so reached 1 1 0, count 2, and the last row is 2.
-        reached = np.ones((len(row), n), np.float32)  # (B, n)
-        reached[:, 1:] = np.cumprod(live[:, :-1], 1)
+        reached = np.cumprod(np.insert(live[:, :-1], 0, True, 1), 1, np.float32)  # (B, n)
         discounts = np.float32(gamma) ** np.arange(n, dtype=np.float32)  # (n,)
         r = (reached * discounts * self.rewards[rows, envs]).sum(1)  # (B,)
         count = reached.sum(1).astype(int)  # (B,) rewards in r
@@ -265,11 +263,11 @@ class Replay:
         return self.frames[np.stack(rows, 1), env[:, None]]  # (B, 4, 84, 84)
 
 
-def mirror(b: Batch, actions: int, rng: Generator) -> Batch:
+def mirror(b: Batch, actions: int, rng: np.random.Generator) -> Batch:
     """[+mirror] Reflect half of the transitions: frames left to right, a -> A - 1 - a.
 
-    Flight, reward and camera are symmetric, so the reflection is one more true transition. Only the
-    forest's grid is not quite symmetric: it stands 0.5 m off centre.
+    Flight, reward and camera are symmetric, so the reflection is one more valid transition (data
+    augmentation). Only the forest's grid is not quite symmetric: it stands 0.5 m off centre.
     """
     half = torch.from_numpy(rng.random(len(b.a)) < 0.5)  # (B,)
     for frames in (b.s, b.s2):
@@ -285,7 +283,7 @@ class Agent(nn.Module):
     over many updates is steadier (stochastic weight averaging), so it is what flies in the end.
     """
 
-    def __init__(self, c: DQNConfig, actions: int, rng: Generator) -> None:
+    def __init__(self, c: DQNConfig, actions: int, rng: np.random.Generator) -> None:
         super().__init__()
         with torch.random.fork_rng():  # afterwards torch's generator is as it was
             torch.manual_seed(int(rng.integers(2**63)))
@@ -381,7 +379,7 @@ def due(every: int, step: int, num_envs: int) -> int:
 #     15          every C steps reset Q^ = Q
 
 
-def train(c: DQNConfig, envs: Any, rng: Generator, shaped: Callable) -> Iterator[tuple]:
+def train(c: DQNConfig, envs: Any, rng: np.random.Generator, shaped: Callable) -> Iterator[tuple]:
     """Algorithm 1, for L environments side by side, which share each pass through Q [+num_envs].
 
     envs: a vector environment like env.VecForest. shaped: makes the rewards to learn from. This is

@@ -63,7 +63,6 @@ from render import Scene, draw_frame
 
 STACK = 4  # frames in an observation [DF §II-A]
 OUTCOMES = ("crash", "goal", "far", "back", "side", "time")  # how an episode may end
-Episode = dict  # what Drone.episode returns
 
 
 @dataclass(frozen=True)
@@ -128,19 +127,14 @@ class Drone:
 
     def __init__(self, world: World) -> None:
         self.world, self.outcome = world, "not reset"  # not "", so reset_done begins here
-        self.space, self.body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-        fixed, count = self.space.static_body, math.prod(world.grid)
-        self.shapes = [pymunk.Circle(fixed, world.trunk_radius) for _ in range(count)]
-        self.space.add(self.body, *self.shapes)
 
     def reset(self, seed: int) -> None:
         """Plant forest number `seed`, and stand at the start. ValueError if it is negative."""
         self.seed, self.trunks = seed, plant(seed, self.world)  # (N, 2)
-        for shape, centre in zip(self.shapes, self.trunks.tolist(), strict=True):
-            shape.unsafe_set_offset(centre)  # moves a trunk: ten times as quick as a new one
-        self.space.reindex_static()  # tells pymunk that they moved
-        self.body.position, self.body.angle, self.pose = (0.0, 0.0), 0.0, (0.0, 0.0, 0.0)
-        self.actions, self.outcome = [], ""
+        self.space, self.body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+        fixed, radius = self.space.static_body, self.world.trunk_radius
+        self.space.add(self.body, *(pymunk.Circle(fixed, radius, c) for c in self.trunks.tolist()))
+        self.pose, self.actions, self.outcome = (0.0, 0.0, 0.0), [], ""
         self.progress = self.episode_return = 0.0
         self.sense()
 
@@ -185,7 +179,7 @@ class Drone:
                  "time": len(self.actions) >= world.max_steps}  # fmt: skip
         return next((outcome for outcome, holds in ended.items() if holds), "")
 
-    def episode(self) -> Episode:
+    def episode(self) -> dict:
         """The episode so far: seed, actions as one digit each, and what came of them."""
         return {"seed": self.seed, "actions": "".join(map(str, self.actions)),
                 "outcome": self.outcome, "steps": len(self.actions), "progress": self.progress,
@@ -202,7 +196,7 @@ class VecForest:
     def __init__(self, world: World, num_envs: int, seeds: Iterable) -> None:
         self.world, self.num_actions = world, world.num_actions
         self.drones, self.seeds = [Drone(world) for _ in range(num_envs)], iter(seeds)
-        self.episodes: list[Episode] = []  # all that have ended
+        self.episodes: list[dict] = []  # all that have ended
         self.history: list[bytes] = []  # all actions, from which deepflight.Run resumes
         self.steps = 0  # control steps of all drones together
 
@@ -234,7 +228,7 @@ class VecForest:
         return s2, r, ~np.isin(outcomes, ("", "time")), outcomes == "time", drones
 
 
-Pilot = Callable[[ndarray, VecForest], Sequence[int]]  # observations (E, 4, 84, 84) -> actions (E,)
+Pilot = Callable[[ndarray, VecForest], Sequence[int]]  # a policy: (E, 4, 84, 84) -> actions (E,)
 
 
 def random_pilot(rng: np.random.Generator) -> Pilot:
@@ -247,7 +241,7 @@ def straight_pilot(s: ndarray, envs: VecForest) -> list[int]:
     return [envs.num_actions // 2] * len(s)
 
 
-def fly(pilot: Pilot, seeds: Sequence[int], world: World) -> list[Episode]:
+def fly(pilot: Pilot, seeds: Sequence[int], world: World) -> list[dict]:
     """Fly one episode per seed, up to 100 side by side; returns them sorted by seed, so that
     pilots can be compared forest by forest."""
     envs = VecForest(world, min(len(seeds), 100), seeds)
@@ -256,7 +250,7 @@ def fly(pilot: Pilot, seeds: Sequence[int], world: World) -> list[Episode]:
     return sorted(envs.episodes, key=lambda episode: episode["seed"])
 
 
-def refly(episode: Episode, world: World) -> Iterator[Drone]:
+def refly(episode: dict, world: World) -> Iterator[Drone]:
     """Fly an episode again: yields the drone at the start and after each step."""
     drone = Drone(world)
     drone.reset(episode["seed"])

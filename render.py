@@ -52,7 +52,6 @@ Not in this file: textures, shadows, leaning trunks, a drone that climbs.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -66,7 +65,6 @@ PIXELS = 84  # height and width of a frame [DF §II-A]
 SLOPES = ((PIXELS - 1) / 2 - np.arange(PIXELS)) / (PIXELS / 2)
 BEARINGS = np.arctan(SLOPES)  # (84,) rad, counter-clockwise from straight ahead
 COSINES = np.cos(BEARINGS)  # (84,) depth for each metre along a ray
-CAMERAS = ("grey", "disparity")  # the two kinds
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ class Scene:
     beacon_height: float = 20.0  # m
     beacon_radius: float = 1.0  # m
     beacon_pixels: float = 3.0  # px, the beacon is never drawn narrower than this
-    camera: str = "grey"  # one of CAMERAS
+    camera: str = "grey"  # or "disparity"
     near: float = 2.0  # m, disparity is 255 at this depth
     sky: int = 90  # this and all below: grey levels
     ground: int = 60
@@ -144,7 +142,7 @@ def paint(frame: ndarray, depth: ndarray, height: float, value: ndarray, scene: 
     return np.where(inside, value.astype(np.uint8), frame)
 
 
-def draw_frame(pose: Sequence[float], trunks: ndarray, scene: Scene) -> ndarray:
+def draw_frame(pose: tuple, trunks: ndarray, scene: Scene) -> ndarray:
     """What a drone sees: a frame (84, 84) uint8. pose: x, y in m, heading in rad. trunks (N, 2): m.
 
     Like a painter it draws the background, then the pole over it, then the trunks before the pole.
@@ -166,7 +164,7 @@ def draw_frame(pose: Sequence[float], trunks: ndarray, scene: Scene) -> ndarray:
     return paint(frame, depth, scene.trunk_height, shade(grey, distance, depth, scene), scene)
 
 
-def seen_from(pose: Sequence[float], points: ndarray) -> ndarray:
+def seen_from(pose: tuple, points: ndarray) -> ndarray:
     """How far ahead of a drone and to its left these points lie: (N, 2) m.
 
     pose: x, y in m and heading in rad. points (N, 2): x, y in m.

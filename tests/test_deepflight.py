@@ -11,7 +11,6 @@ import sys
 import zipfile
 from collections import namedtuple
 from dataclasses import fields
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -44,13 +43,13 @@ def test_wilsons_interval_ends_1_96_standard_errors_away() -> None:
 
 
 def test_the_metrics_of_two_forests_by_hand() -> None:
-    random = [FLOWN | {"steps": n} for n in (10, 30, 20, 40)]  # forests A, B, A, B: 15 and 35 steps
+    random = [FLOWN | {"steps": n} for n in (15, 35)]  # in forests A and B
     far = {"steps": 170, "progress": 90.0, "return": 9.0, "outcome": "far"}
-    metrics = deepflight.summarize([FLOWN | {"steps": 30}, far], random, 2)
+    metrics = deepflight.summarize([FLOWN | {"steps": 30}, far], random)
     # Two forests drawn again are A twice, B twice or one of each: ratios 2, 34/7 and 4.
     assert metrics["longer"] == approx({"value": 3.0, "low": 1.0, "high": 27 / 7})
     assert metrics["steps"] == {"value": 100.0, "low": 30.0, "high": 170.0}
-    assert deepflight.summarize(random, random, 2)["crash"] == wilson(1.0, 2)  # of two forests
+    assert deepflight.summarize(random, random)["crash"] == wilson(1.0, 2)
     table = measure([FLOWN | {"outcome": o, "steps": 1} for o in env.OUTCOMES])
     assert table["crossed"].tolist() == [o in ("goal", "far") for o in env.OUTCOMES]
     assert (np.array([table[o] for o in env.OUTCOMES]) == np.eye(6)).all()
@@ -148,6 +147,7 @@ def test_on_a_full_disk_the_old_file_stays_and_nothing_else(tmp_path: Path) -> N
 BAD = "|fly|train now|train --batch-size many|train --gamma 1.5|train --gamma nan|train --steps 0"
 BAD += "|train --camera colour|train --name taken|train --replay-size 10|train --resume nowhere"
 BAD += "|train --resume text.pt|eval --episodes 0|eval --episodes few|eval --first-seed -1"
+BAD += "|train --steps inf|train --seed nan|train --batch-size 2.5|eval --episodes 1e9"
 BAD += "|eval --weights nowhere.pt|eval --weights text.pt|eval --out text.pt|eval --json ."
 
 
@@ -184,21 +184,17 @@ def test_without_torch_one_line_says_what_to_do() -> None:
 
 
 @pytest.mark.usefixtures("here")
-def test_eval_prints_a_table_and_writes_json_and_a_film(
-    monkeypatch: MonkeyPatch, capsys: CaptureFixture
-) -> None:
-    random = partial(env.fly, env.random_pilot(np.random.default_rng(0)))
-    monkeypatch.setattr(deepflight, "fly_random", lambda seeds, w: random(seeds, w) * 2)
+def test_eval_prints_a_table_and_writes_json_and_a_film(capsys: CaptureFixture) -> None:
     assert main(["eval", "--episodes", "2", "--json", "out/r.json", "--out", "film"]) == 0
     out, error = capsys.readouterr()
     head, *rows, _, wrote = out.splitlines()[2:]
     assert (head.split(), len(rows)) == (["random", "straight", "dqn"], 6)
-    assert error == "flying straight\nflying dqn\n"
+    assert error == "flying random\nflying straight\nflying dqn\n"
     assert wrote.startswith("wrote film/dqn.gif: forest 400000000")
     with Image.open("film/dqn.gif") as film:
         assert (film.info["duration"], film.info["loop"]) == (100, 0) and film.n_frames > 20
     pilots = json.loads(Path("out/r.json").read_text())["pilots"]
-    assert [len(metrics["episodes"]) for metrics in pilots.values()] == [4, 2, 2]
+    assert [len(metrics["episodes"]) for metrics in pilots.values()] == [2, 2, 2]
     for episode in pilots["random"]["episodes"] + pilots["dqn"]["episodes"]:
         *_, drone = env.refly(episode, env.World())
         assert drone.episode() == episode
@@ -211,7 +207,6 @@ import sys, signal
 del signal.SIGHUP, signal.SIGPIPE
 import deepflight as d
 d.VALIDATION = range(10**9, 10**9 + 2)
-d.fly_random = lambda seeds, world: d.fly(d.env.straight_pilot, seeds, world)
 assert d.main("train --steps 8e1 --learning-starts 80".split()) == 0
 assert d.main("eval --episodes 1 --weights runs/001".split()) == 0
 """
@@ -222,7 +217,7 @@ def test_under_a_profiler_and_without_what_windows_lacks_train_and_eval_work(her
     words = [sys.executable, "-m", "cProfile", "-o", "profile", "windows.py"]
     path = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(words, env=path, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "flying straight\nflying dqn\n")
+    assert (done.returncode, done.stderr) == (0, "flying random\nflying straight\nflying dqn\n")
     assert (here / "runs/eval/001.gif").stat().st_size > 1000
     assert '"steps": 80,' in (here / "runs/001/config.json").read_text()
     assert {"train", "evaluate"} <= {name for _, _, name in pstats.Stats("profile").stats}

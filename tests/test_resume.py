@@ -21,7 +21,8 @@ import dqn
 from deepflight import Config, Run, load, main
 from env import World, refly
 
-KEYS = ["config", "fingerprint", "log", "flown", "actions", "forests", "rng", "agent", "optimizer"]
+KEYS = ["config", "fingerprint", "log", "validations", "actions", "forests", "rng"]
+KEYS += ["agent", "optimizer"]
 SMALL = {"steps": 400, "learning_starts": 100, "replay_size": 200, "target_every": 120}
 SMALL |= {"update_every": 16, "batch_size": 8}  # the replay wraps at step 200
 WORDS = [x for key, n in SMALL.items() for x in (f"--{key.replace('_', '-')}", str(n))]

@@ -47,7 +47,6 @@ from numpy import ndarray
 from deepflight import VALIDATION, load_weights, save
 from dqn import InputError, QNetwork
 from env import VecForest, World
-from render import CAMERAS
 
 ROOT, SIZE = Path(__file__).parents[2], 1000
 WARMUP, CALLS = 50, 1000  # decisions before and in a timing
@@ -113,7 +112,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--weights", type=Path, help="default: weights/dqn.pt")
     which.add_argument("--beacon", action="store_true", help="the shipped ones that see a beacon")
-    which.add_argument("--camera", choices=CAMERAS, default="grey", help="what a pixel says")
+    cameras = ("grey", "disparity")
+    which.add_argument("--camera", choices=cameras, default="grey", help="what a pixel says")
     parser.add_argument("--out", type=Path, help="default: beside --weights, for others runs/")
     args = parser.parse_args(argv)
     torch.set_num_threads(1)

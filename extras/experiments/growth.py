@@ -16,16 +16,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from env import OUTCOMES, Drone, Episode, World, refly
+from env import OUTCOMES, Drone, World, refly
 from extras.experiments.maps import COLOURS, draw_map, draw_ways
 
 ROOT = Path(__file__).parents[2]
 SHARES = 0.025, 0.075, 0.25, 1.0  # of the training's length, at which the four moments are
 ENDS = {"": "in the air", "crash": "hit a trunk", "goal": "arrived", "time": "out of time"}
-ENDS |= {side: f"left by the {side} edge" for side in ("far", "side", "back")}
+ENDS |= {"far": "crossed", "side": "left by a side", "back": "left by the back"}
 
 
-def read(folder: Path) -> tuple[World, dict[str, list[Episode]]]:
+def read(folder: Path) -> tuple[World, dict[str, list[dict]]]:
     """The world, and for each of four moments a title and the episodes flown then."""
     config = json.loads((folder / "config.json").read_text())
     with (folder / "log.csv").open() as file:
@@ -57,12 +57,12 @@ def headed(picture: Image.Image, title: str) -> Image.Image:
     return panel
 
 
-def path(episode: Episode, world: World) -> np.ndarray:
+def path(episode: dict, world: World) -> np.ndarray:
     """The places (T, 2) in m that an episode went through."""
     return np.array([drone.pose[:2] for drone in refly(episode, world)])
 
 
-def all_ways(title: str, episodes: list[Episode], world: World) -> Image.Image:
+def all_ways(title: str, episodes: list[dict], world: World) -> Image.Image:
     """Every way of a moment on one map; the trunks differ, and are left out."""
     plain = draw_map(np.empty((0, 2)), (world.length, world.width))
     image = draw_ways(plain, [(path(e, world), e["outcome"], "") for e in episodes])
@@ -70,7 +70,7 @@ def all_ways(title: str, episodes: list[Episode], world: World) -> Image.Image:
     draw, x = ImageDraw.Draw(panel), 20.0
     for end in OUTCOMES:
         if count := sum(episode["outcome"] == end for episode in episodes):
-            text = f"{count} {ENDS[end].removeprefix('left by the ')}"
+            text = f"{count} {ENDS[end]}"
             draw.circle((x + 5, 29), 5, fill=COLOURS[end])
             draw.text((x + 13, 21), text, fill="black", font_size=13)
             x += draw.textlength(text, font_size=13) + 26
@@ -86,7 +86,7 @@ def moment(drone: Drone, way: np.ndarray, title: str, world: World) -> Image.Ima
     return headed(picture, f"{title}: {ENDS[drone.outcome]}")
 
 
-def film(flown: dict[str, Episode], world: World) -> list[Image.Image]:
+def film(flown: dict[str, dict], world: World) -> list[Image.Image]:
     """The pictures of the film; each episode holds its last one until the longest has ended."""
     panels = []
     for title, episode in flown.items():
@@ -96,7 +96,7 @@ def film(flown: dict[str, Episode], world: World) -> list[Image.Image]:
             if t % 2 == 0 or drone.outcome:
                 pictures.append(moment(drone, np.array(way), title, world))
         panels.append(pictures)
-    longest = max(map(len, panels)) + 15
+    longest = max(map(len, panels)) + 30
     shown = ([panel[min(t, len(panel) - 1)] for panel in panels] for t in range(longest))
     return [sheet(pictures).quantize(32, Image.Quantize.FASTOCTREE) for pictures in shown]
 

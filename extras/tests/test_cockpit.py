@@ -20,7 +20,7 @@ import torch
 
 from deepflight import Config, dqn_pilot, load_weights, measure, save, save_weights
 from dqn import QNetwork
-from env import Episode, Pilot, World, fly, refly, straight_pilot
+from env import Pilot, World, fly, refly, straight_pilot
 from extras.cockpit.__main__ import LARGEST, Server
 from extras.cockpit.episodes import ROOT, Hangar
 from extras.lessons.expert import laser_pilot
@@ -201,7 +201,7 @@ def test_the_page_learns_which_weights_imitate(server: Server) -> None:
         assert named[name] == name.split("-")[0]
 
 
-def keep_training(folder: Path, flown: dict[int, list[Episode]], **settings: object) -> None:
+def keep_training(folder: Path, flown: dict[int, list[dict]], **settings: object) -> None:
     """Write what a training keeps: flown holds the episodes of each validation, by its step."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").write_text(json.dumps(asdict(Config(**settings))))
@@ -217,7 +217,7 @@ def keep_training(folder: Path, flown: dict[int, list[Episode]], **settings: obj
     save(folder / "validation.jsonl", text.encode())
 
 
-def network_episodes() -> list[Episode]:
+def network_episodes() -> list[dict]:
     """A thousand that the shipped network flew: they end in many ways."""
     report = json.loads((ROOT / "results/dqn.json").read_text())
     return report["pilots"]["dqn"]["episodes"]

@@ -22,7 +22,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from deepflight import dqn_pilot, load_weights
 from dqn import QNetwork
-from env import Drone, Episode, World, fly, random_pilot, refly
+from env import Drone, World, fly, random_pilot, refly
 from extras.cockpit.episodes import ROOT
 from extras.experiments.cockpit_pictures import (
     CHROMIUM,
@@ -633,7 +633,7 @@ ENDS = {"goal": "arrived", "far": "left by the far edge", "side": "left by a sid
         "back": "left by the back", "crash": "hit a trunk", "time": "ran out of time"}  # fmt: skip
 
 
-def validations(number: int) -> dict[int, list[Episode]]:
+def validations(number: int) -> dict[int, list[dict]]:
     """The first at random, the others by the shipped network; 48 episodes each."""
     rng, some = np.random.default_rng(0), network_episodes()
     flown = [fly(random_pilot(rng), range(10**9, 10**9 + 48), World())]
@@ -642,7 +642,7 @@ def validations(number: int) -> dict[int, list[Episode]]:
 
 
 @pytest.fixture(scope="module")
-def flown() -> dict[int, list[Episode]]:
+def flown() -> dict[int, list[dict]]:
     return validations(4)
 
 
@@ -658,7 +658,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def school(root: Path, flown: dict[int, list[Episode]]) -> Iterator[str]:
+def school(root: Path, flown: dict[int, list[dict]]) -> Iterator[str]:
     """A cockpit with a training of three validations, `runs/mine`, and its own network."""
     keep_training(root / "runs/mine", {step: flown[step] for step in STEPS[:3]})
     shutil.copy(ROOT / "weights/dqn.pt", root / "runs/mine/best.pt")
@@ -682,7 +682,7 @@ def drawn(browser: Chrome) -> list[list[tuple[float, float]]]:
     return [[(x, -y) for x, y in zip(d[::2], d[1::2], strict=True)] for d in numbers]
 
 
-def assert_shows(browser: Chrome, episodes: list[Episode]) -> None:
+def assert_shows(browser: Chrome, episodes: list[dict]) -> None:
     ways, known = drawn(browser), value(browser, "now().episodes.map((e) => e.way)")
     assert len(ways) == len(episodes) == 48
     for way, line, episode in zip(known, ways, episodes, strict=True):
@@ -693,7 +693,7 @@ def assert_shows(browser: Chrome, episodes: list[Episode]) -> None:
 
 
 def test_the_button_shows_the_last_validation_of_a_training(
-    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+    browser: Chrome, school: str, flown: dict[int, list[dict]]
 ) -> None:
     visit(browser, school, seed=SEED)
     click(browser, "learning")
@@ -708,7 +708,7 @@ def test_the_button_shows_the_last_validation_of_a_training(
 
 
 def test_keys_range_buttons_and_curves_go_through_the_training(
-    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+    browser: Chrome, school: str, flown: dict[int, list[dict]]
 ) -> None:
     study(browser, school, step=STEPS[1])
     assert_shows(browser, flown[STEPS[1]])
@@ -735,7 +735,7 @@ def point(browser: Chrome, x: float, y: float, click: bool = False) -> None:
 
 
 def test_the_legend_counts_and_has_the_colours_of_the_ways(
-    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+    browser: Chrome, school: str, flown: dict[int, list[dict]]
 ) -> None:
     okabe_ito = ("230, 159, 0", "86, 180, 233", "0, 158, 115", "0, 114, 178", "213, 94, 0",
                  "204, 121, 167")  # fmt: skip
@@ -758,7 +758,7 @@ def test_the_legend_counts_and_has_the_colours_of_the_ways(
 
 
 def test_curves_show_the_log_over_the_band_of_committed_trainings(
-    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+    browser: Chrome, school: str, flown: dict[int, list[dict]]
 ) -> None:
     study(browser, school, step=STEPS[1])
     rows = browser.find_elements(By.CSS_SELECTOR, "#progress .curve span")
@@ -790,7 +790,7 @@ def lone(browser: Chrome) -> tuple[int, float, float]:
     return i, x, y
 
 
-def told(episode: Episode) -> str:
+def told(episode: dict) -> str:
     """What the page says of an episode."""
     seconds, total = (
         episode["steps"] / 10,
@@ -800,7 +800,7 @@ def told(episode: Episode) -> str:
 
 
 def test_pointer_and_keys_name_an_episode(
-    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+    browser: Chrome, school: str, flown: dict[int, list[dict]]
 ) -> None:
     study(browser, school, step=STEPS[2])
     i, x, y = lone(browser)
@@ -815,7 +815,7 @@ def test_pointer_and_keys_name_an_episode(
 
 @pytest.mark.parametrize("way", ["click", "Enter"])
 def test_a_chosen_episode_is_flown_as_it_was(
-    browser: Chrome, school: str, flown: dict[int, list[Episode]], way: str
+    browser: Chrome, school: str, flown: dict[int, list[dict]], way: str
 ) -> None:
     study(browser, school, step=STEPS[1])
     i, x, y = lone(browser) if way == "click" else (0, 0, 0)
@@ -853,7 +853,7 @@ def test_a_recorded_way_without_its_weights_has_no_look_inside(
 
 
 def test_the_address_restores_training_and_validation_or_the_recorded_episode(
-    browser: Chrome, school: str, flown: dict[int, list[Episode]]
+    browser: Chrome, school: str, flown: dict[int, list[dict]]
 ) -> None:
     study(browser, school)
     press(browser, Keys.ARROW_LEFT)
@@ -890,7 +890,7 @@ def test_in_another_forest_the_network_flies(browser: Chrome, school: str) -> No
 
 
 def test_a_validation_appears_while_one_looks(
-    browser: Chrome, school: str, root: Path, flown: dict[int, list[Episode]]
+    browser: Chrome, school: str, root: Path, flown: dict[int, list[dict]]
 ) -> None:
     keep_training(root / "runs/mine", {step: flown[step] for step in STEPS[:2]})
     study(browser, school)
@@ -910,7 +910,7 @@ def test_a_validation_appears_while_one_looks(
 
 
 def test_a_broken_training_is_a_line_and_the_page_goes_on(
-    browser: Chrome, school: str, root: Path, flown: dict[int, list[Episode]]
+    browser: Chrome, school: str, root: Path, flown: dict[int, list[dict]]
 ) -> None:
     keep_training(root / "runs/bad", {STEPS[0]: flown[STEPS[0]]})
     keep_training(root / "runs/none", {STEPS[0]: flown[STEPS[0]]})
@@ -942,7 +942,7 @@ def test_without_a_training_the_view_says_how_to_begin_one(browser: Chrome, root
         assert browser.find_element(By.ID, "map").is_displayed()
 
 
-def test_a_finger_on_a_phone_flies_an_episode(school: str, flown: dict[int, list[Episode]]) -> None:
+def test_a_finger_on_a_phone_flies_an_episode(school: str, flown: dict[int, list[dict]]) -> None:
     with browsing(390, 844, mobile=True) as phone:
         study(phone, school, step=STEPS[1])
         assert value(phone, "document.documentElement.scrollWidth") <= 390

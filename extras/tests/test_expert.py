@@ -239,7 +239,7 @@ def finish(c: Config, folder: Path, cuts: Sequence[int] = ()) -> Run:
         while run.envs.steps < cut:
             next(run.loop)
         run.save_checkpoint()
-        keys = "config", "log", "flown", "actions", "forests", "rng", "agent", "optimizer"
+        keys = "config", "log", "validations", "actions", "forests", "rng", "agent", "optimizer"
         run = Run(c, folder, deepflight.load(folder / "checkpoint.pt", *keys))
     assert run.go() == 0
     return run
