@@ -25,7 +25,7 @@ A seed is a forest, and there are three sets of them:
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
 A run's folder holds config.json, log.csv, validation.jsonl (one line an episode), checkpoint.pt and
-best.pt: the best weights in validation, or after nine tenths of the steps the mean since then.
+best.pt: the best weights in validation, or in the last tenth of the steps their mean so far.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -108,7 +108,7 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     more than arrival. So look at the share that arrived too, and not only at that which crossed.
 
     On purpose, these parts change which way of flying is best. Parts of the form gamma * f(s2) -
-    f(s), with f = 0 at the end, would not [Ng 1999]. All printed returns leave the three out.
+    f(s), with any f that ends at 0, would not [Ng 1999]. All printed returns leave the three out.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -134,7 +134,7 @@ class Run:
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log, self.validations = c, folder, [], []
         self.rng = np.random.default_rng(c.seed)
-        self.forest_rng = np.random.default_rng([c.seed, 1])  # or exploring changes the forests
+        self.forest_rng = np.random.default_rng([c.seed, 1])  # apart from rng, which explores
         seeds = iter(lambda: int(self.forest_rng.integers(TRAIN_END)), None)  # without end
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)  # dqn.train, or a lesson's
@@ -168,8 +168,8 @@ class Run:
 
     def validate(self, seconds: float) -> None:
         """Fly the validation forests without exploring, add a row to the log, and keep the weights
-        of the best score: the share that crossed (with the beacon: arrived), then the progress. The
-        mean of the weights is kept whatever its score, because the best of many is partly luck."""
+        of the best score: the share that crossed (with the beacon: arrived), then, if equal, the
+        progress. Their mean is kept whatever its score, because the best of many is partly luck."""
         envs, averaged = self.envs, self.agent.averaged.n_averaged > 0
         # best.pt keeps half precision, so fly what it will hold.
         q = copy.deepcopy(self.agent.averaged.module if averaged else self.agent.q).half().float()
@@ -194,6 +194,7 @@ class Run:
         minutes = max(self.c.steps - envs.steps, 0) / speed / 60  # that are left
         print(ROW.format(**row, speed=speed, minutes=minutes), flush=True)
 
+    # Skip on a first reading: how a training goes on after an interruption.
     def save_checkpoint(self) -> None:
         """Write the checkpoint, 34 MB. In place of the replay it holds all actions, a byte each."""
         content = {"config": asdict(self.c), "fingerprint": fingerprint(self.c), "log": self.log,
@@ -211,7 +212,7 @@ class Run:
             s2, r, terminated, truncated, drones = self.envs.step(actions)
             r = shaped_reward(r, drones, self.c)  # (L,)
             self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
-        if self.forest_rng.bit_generator.state != saved["forests"]:  # not as many have begun
+        if self.forest_rng.bit_generator.state != saved["forests"]:  # another number began
             raise InputError(f"{self.folder}: its actions lead to other episodes on this machine")
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])
@@ -248,7 +249,7 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
         report = {"weights": args.weights.name, "forests": len(seeds), "first_seed": seeds[0]}
         report["pilots"] = {who: metrics[who] | {"episodes": flown[who]} for who in flown}
         save(args.json, json.dumps(report).encode())
-    shown = flown[name][measure(flown[name])["crossed"].argmax()]  # that crossed, or the first
+    shown = flown[name][measure(flown[name])["crossed"].argmax()]  # the first that crossed, else 0
     save_film(film, shown, world, q, name)
     print(f"\nwrote {film}: forest {shown['seed']}")
     return 0
@@ -343,7 +344,7 @@ def load(path: Path | str, *keys: str) -> dict[str, Any]:
     """Read what save wrote, without running any code from the file. InputError if it cannot be
     read, is damaged, or does not hold these keys."""
     try:
-        archive = zipfile.ZipFile(path)  # its checksums leave out the flags, which are 0 in torch's
+        archive = zipfile.ZipFile(path)  # checksums leave out flags, and damaged ones mislead torch
         if archive.testzip() or any(part.external_attr for part in archive.infolist()):
             raise zipfile.BadZipFile
         content = torch.load(path, weights_only=True)

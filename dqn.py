@@ -9,7 +9,7 @@ late. Three rewards 1, 1, -10 and then the end: 1 + 0.99 * 1 + 0.99^2 * -10 = -7
 step. An agent that knows Q can act: it takes the action with the highest Q. Here a neural network
 learns Q. It is a function with 1.7 million adjustable numbers, its weights: four frames go in, nine
 numbers come out. For each Q(s, a) it needs a target y. Nobody has the true one. But the return from
-s is r plus gamma times the best from s2, so every transition (s, a, r, s2) makes its own target:
+s is r plus gamma times that from s2, so every transition (s, a, r, s2) makes its own target:
 
     y = r + gamma * max over a2 of Q(s2, a2)        or y = r, if the world ended the episode
 
@@ -28,8 +28,8 @@ single possible action, and let all Q be 0 at first. Each update sets all three 
 The truth moves backwards. Three things can go wrong, and DQN has an answer to each:
   * Steps that follow each other are alike (correlated samples), and a network that learns from them
     in that order forgets the rest. So a **replay** buffer keeps transitions, and each update draws
-    some at random. Older, worse agents flew them, and yet they serve: y uses the best action in s2,
-    whichever was taken (Q-learning is off-policy; but see `window`).
+    some at random. Older, worse agents flew them, and they still serve: y takes the best a2, not
+    the one that was flown (Q-learning is off-policy; but see `window`).
   * Each update of Q would also move its own targets, in a chase without end. So they come from a
     **target network** Q^, a copy of Q that is synced only now and then.
   * An agent that always does what seems best never finds what is better. So it **explores**: with
@@ -122,11 +122,11 @@ class QNetwork(nn.Module):
 
     Each number that leaves a layer is a weighted sum of numbers that enter it, plus a constant, its
     bias: inputs 2 and -1, weights 3 and 4 and bias 1 make 3 * 2 + 4 * -1 + 1 = 3. In a linear layer
-    every output sees all inputs. In a convolution it sees a small square of each, with the same
-    weights in every place: a filter. A filter of two pixels with weights -1 and 1 makes 0 4 0 of
-    the row 5 5 9 9: it finds the edge. Filters of 8x8 pixels that move on by 4 have (84 - 8) / 4 +
-    1 = 20 places in a row of 84. ReLU turns negative numbers into 0; without it, two layers could
-    do no more than one. The last layer has none, because values may be negative.
+    every output sees all inputs. In a convolution it sees a small square of each input image, with
+    the same weights in every place: a filter. A filter of two pixels with weights -1 and 1 makes
+    0 4 0 of the row 5 5 9 9: it finds the edge. Filters of 8x8 pixels that move on by 4 have
+    (84 - 8) / 4 + 1 = 20 places in a row of 84. ReLU turns negative numbers into 0; without it, two
+    layers could do no more than one. The last layer has none, because values may be negative.
 
     A Tensor is an ndarray that remembers how it was made, so backward() can find the gradient of
     every weight (see `learn`). Under no_grad() it forgets. A Module is a function with weights, and
@@ -277,7 +277,8 @@ def mirror(b: Batch, actions: int, rng: np.random.Generator) -> Batch:
 
 
 class Agent(nn.Module):
-    """What learning changes: Q, the target network Q^, the optimizer, and the mean of Q's weights.
+    """What learning changes: Q, the target network Q^, the optimizer, and the mean of Q's weights
+    (Algorithm 1, lines 2 and 3: see `train`).
 
     [+swa_fraction] Each update changes how Q flies, for better or worse. The mean of the weights
     over many updates is steadier (stochastic weight averaging), so it is what flies in the end.
@@ -302,8 +303,8 @@ def td_target(b: Batch, q2: Tensor, q2_online: Tensor) -> Tensor:
     a2 is chosen. In [Mnih15] both are the same, so the value of a2 is the maximum.
 
     [+double] A maximum of noisy values is too high (overestimation bias). Let two actions both be
-    worth 0, and let Q^ err by +1 and -1: the maximum is 1. If Q, whose errors are others, chooses
-    a2 instead, it hits +1 and -1 about equally often, which makes 0 on average.
+    worth 0, and let Q^ err by +1 and -1: the maximum is 1. If Q, whose errors differ, chooses a2
+    instead, it hits +1 and -1 about equally often, which makes 0 on average.
     """
     a2 = q2_online.argmax(1, keepdim=True)  # (B, 1)
     v2 = q2.gather(1, a2)[:, 0]  # (B,) q2[i, a2[i]] of each i
@@ -311,7 +312,7 @@ def td_target(b: Batch, q2: Tensor, q2_online: Tensor) -> Tensor:
 
 
 def learn(agent: Agent, b: Batch, c: DQNConfig) -> None:
-    """One update: lines 13 and 14.
+    """One update (Algorithm 1, lines 13 and 14: see `train`).
 
     The loss is one number that says how wrong a batch is, and its gradient says for each weight how
     the loss changes if that weight grows. An example with one weight w = 2 and one input x = 4: Q
@@ -326,8 +327,9 @@ def learn(agent: Agent, b: Batch, c: DQNConfig) -> None:
 
     Adam, the optimizer, moves each weight by -lr * m / (sqrt(v) + eps). m = 0.9 * m + 0.1 * g is a
     running mean of its gradient g, and v of g**2, with 0.999 and 0.001 (both corrected for their
-    start at 0). So all weights move about equally fast, and slower where gradients are below eps:
-    Rainbow's 1.5e-4 [Hessel 2018], times huber_delta, because gradients may be that much larger.
+    start at 0). m / sqrt(v) is about 1 at most, so all weights move about equally fast, and slower
+    where gradients are below eps: Rainbow's 1.5e-4 [Hessel 2018], times huber_delta, because
+    gradients may be that much larger.
     """
     with torch.no_grad():
         q2 = agent.q_target(b.s2, c.bfloat16)  # (B, A)
@@ -351,8 +353,8 @@ def linear_schedule(step: int, first: float, final: float, steps: int) -> float:
 
 
 def due(every: int, step: int, num_envs: int) -> int:
-    """How often something that happens every `every` steps falls in one pass, whose last step is
-    `step`: steps 9 to 16 hold two multiples of 4, so two updates are due.
+    """How many multiples of `every` one pass holds, if its last step is `step`: the steps 9 to 16
+    hold two multiples of 4, so two updates are due.
 
     >>> due(4, 16, 8), due(2_000, 16, 8)
     (2, 0)

@@ -6,9 +6,9 @@
                  |  o    o  o     o    o   o     o   o    o  o   |       stand beyond the far edge
     start (0, 0) *~~~~.  o    o    o  o    o   o    o   o    o   G goal (90, 0)
                  | o   `~~~~~~> o    o   o    o   o    o    o    |
-    right edge   |   o    o   psi  o    o   o    o   o   o     o | o
+    right edge   |   o    o        o    o   o    o   o   o     o | o
         y = -25  +-----------------------------------------------+
-               x = 0                                                             x = 90
+               x = 0                                           x = 90
 
 The drone never slows down. Ten times a second it picks one of nine yaw rates, flies 0.5 m, and gets
 a new frame from its camera. Each step earns a reward, which says how good the step was:
@@ -44,7 +44,7 @@ Legend
     d_obs     m, from the drone's centre to the nearest trunk's surface, at most a laser's range
     d_goal    m, from the drone's centre to the goal
     d_max     m, the forest's length
-    psi       the heading in rad, counter-clockwise from x; y points to the left
+    heading   rad, counter-clockwise from x; y points to the left
     N, E      trunks; active drones, which are those whose episodes have not ended
     [DF]      the Deep Flight paper; "authors' simulator": its code; "ours": from neither
 
@@ -126,7 +126,7 @@ class Drone:
     """
 
     def __init__(self, world: World) -> None:
-        self.world, self.outcome = world, "not reset"  # not "", so reset_done begins here
+        self.world, self.outcome = world, "not reset"  # as if ended: reset_done begins
 
     def reset(self, seed: int) -> None:
         """Plant forest number `seed`, and stand at the start. ValueError if it is negative."""
@@ -216,7 +216,7 @@ class VecForest:
         """One control step of the active drones; actions: one for each, in order.
 
         Returns the new observations (E, 4, 84, 84), rewards (E,), terminated (E,), truncated (E,),
-        and the drones that flew, because `active` lacks those that just ended.
+        and the drones that flew: `active` now lacks those that ended.
         """
         drones = self.active
         r = np.array([drone.step(a) for drone, a in zip(drones, actions, strict=True)])  # (E,)

@@ -17,9 +17,9 @@ others. One ray in the ground plane finds it. A camera is 84 rays, and no 3D eng
 Where does a ray meet a trunk?
 
                    .-~~~-.
-    camera ------ # --p-- `------>   along       from the camera to p, the ray's nearest point to
-                 /    |    \                     the trunk's centre c
-                |     c     |        across      from p to c
+    camera ------ #---p---.------>   along       from the camera to p, the ray's nearest point to
+                 / `. |    \                     the trunk's centre c
+                |    `c     |        across      from p to c
                  \         /         half_chord  from the surface # to p
                   `-.....-'          radius      from the surface # to c
 
@@ -106,7 +106,7 @@ def raycast(centres: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray
     half_chord = np.sqrt(np.where(hit, radius**2 - across**2, 0.0))  # (N, M) m
     distance = np.where(hit, along - half_chord, np.inf)  # (N, M) m
     nearest = distance.min(0, initial=np.inf)  # (M,) m
-    half_chord[distance > nearest] = 0.0  # only the nearest trunk's is left for max
+    half_chord[distance > nearest] = 0.0  # the nearest's stays; misses have 0
     return nearest, half_chord.max(0, initial=0.0) / radius
 
 
