@@ -37,9 +37,8 @@ class Server(ThreadingHTTPServer):
         super().__init__((HOST, port), Handler)
         # Browsers leave port 80 out.
         self.lock, at = threading.Lock(), f":{self.server_port}".removesuffix(":80")
-        self.answers = {"/options": hangar.options, "/fly": hangar.fly, "/why": hangar.why}
-        self.answers |= {"/look": hangar.look, "/trainings": hangar.trainings}
-        self.answers["/training"] = hangar.training
+        names = ("options", "fly", "why", "look", "trainings", "training")
+        self.answers = {f"/{name}": getattr(hangar, name) for name in names}
         self.ours = [f"http://{name}{at}" for name in (HOST, "localhost")]
 
     def handle_error(self, *args: Any) -> None:

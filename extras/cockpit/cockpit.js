@@ -1,7 +1,6 @@
 "use strict";
 // The page of the cockpit. It shows what the server answers, and knows no rule of the world.
 // An episode has moments: pose, reward, return, d_obs, q, a frame, and maps where somebody looked inside.
-// learning.js is the other view, of a training.
 
 const $ = (id) => document.getElementById(id);
 const [NEAR, SHOWN] = [2.5, 6]; // m, from the pointer to what it means; how many reasons are told in words
@@ -14,14 +13,15 @@ const MEANING = { you: "You steer.", network: "The network chosen at the right."
 const VALUES = { reward: "reward", return: "return so far", d_obs: "nearest trunk, m" };
 const RECORDED = "recorded"; // the pilot of a training's validation episode, which is whole from the start
 const touch = matchMedia("(pointer: coarse)").matches;
-const [ARROWS, SPACE, GO, STOP] = touch ? ["◀ left or right ▶", "Play", "Play", "Pause"] :
-  ["← or →", "space", "Space or Play", "Space"];
+const [TAP, ARROWS, SPACE, GO, STOP] = touch ? ["Tap", "◀ left or right ▶", "Play", "Play", "Pause"] :
+  ["Click", "← or →", "space", "Space or Play", "Space"];
 let options; // what one may choose from, and the numbers of each world
 let chosen = {}; // world, weights, seed, pilot
 let episode = null; // the episode on show: choice, moments, record, actions, trunks
 let [ghost, plain] = [null, null]; // another one through the same forest; the one to go back to
 let t = 0; // the moment on show
 let [reasons, removed] = [null, null]; // the answer to "why" of moment t; what is taken out on show
+let answers = []; // what Esc takes away, the latest last; some may be gone already
 let [inside, looking] = [false, null]; // whether the filters are on show; the promise of what they find
 let [playing, underway] = [false, null]; // underway: the promise of a step
 let asked = 0; // counts what was asked: what an older question waited for is dropped
@@ -34,7 +34,6 @@ const world = () => options.worlds[chosen.world];
 const weightsOf = (name) => Object.keys(options.worlds[name]?.weights || {});
 const end = () => episode.moments.length - 1;
 const over = () => episode.record.outcome !== "";
-const ended = ({ record: { outcome } }) => ENDS[outcome];
 const crossed = ({ record: { outcome } }) => outcome === "goal" || outcome === "far";
 const isQ = () => world().weights[chosen.weights] === "dqn"; // an imitation scores, and knows no return
 const score = () => (isQ() ? "Q" : "score");
@@ -97,13 +96,14 @@ async function attempt(action) { // Whether it went well. What fails is told in 
 
 // -------------------------------------------------- episodes
 async function begin(actions, moment) { // another choice drops what this one waits for
-  const choice = chosen;
+  const [choice, away] = [chosen, learning()];
   release();
   pause();
   if (!/^\d{1,18}$/.test(choice.seed)) throw Error("The forest is a whole number of at most 18 digits.");
   const found = await extend({ choice, moments: [] }, actions);
   if (choice !== chosen) return;
   [episode, ghost, plain] = [found, null, null];
+  if (away) setView(false); // not sooner, because the old flight would be on show
   drawForest();
   setReasons(null);
   show(Math.min(moment || 0, end()));
@@ -121,12 +121,11 @@ async function begin(actions, moment) { // another choice drops what this one wa
   draw();
 }
 function help() { // what one can do now
-  if (learning()) say(`${touch ? "Tap" : "Click"} a way to fly that episode, or a curve to go there.`);
+  if (learning()) say(`${TAP} a way to fly that episode, or a curve to go there.`);
   else if (!episode) return;
   else if (playing && recorded()) say(`${chosen.training}, ${who()}. Learning goes back to all episodes.`);
   else if (playing) say(steers() ? `Hold ${ARROWS} to turn harder. ${STOP} pauses.` : "");
-  else if (!steers()) say(`Press ${GO}, or drag the time line. Click a trunk or a bar to ask the network.
-    Or take over, and do better.`);
+  else if (!steers()) say(`Press ${GO}, or drag the time line. ${TAP} a trunk or bar to ask. Or take over.`);
   else if (t) say(`You have the controls: ${ARROWS} fly on from here, ${SPACE} flies straight on.`);
   else say(`Press ${ARROWS} to take off. Hold to turn harder. The network flies along as a ghost.`);
 }
@@ -141,7 +140,7 @@ async function steer() {
   if (before === asked) help();
   if (!over()) return;
   pause();
-  say(`You: ${ended(mine)}. Fly this forest Again, or the Next. Or drag the time line, and ask why.`);
+  say(`You: ${ENDS[mine.record.outcome]}. Fly Again, or the Next. Or drag the time line, and ask why.`);
 }
 function turn() {
   const on = (side) => stick.held[side] || stick.tapped[side] || 0;
@@ -153,8 +152,9 @@ function turn() {
 function hold(side, down) {
   stick.held[side] = down ? 1 : 0;
   if (!down) return;
-  if (!steers()) pause(); // what was asked is dropped
-  if (!steers()) return say("To steer, go back before the end and press Take over here. Or press Again.");
+  const no = t === end() && over() ? "The flight ends here. Press Again, or go back and press Take over here."
+    : "Press Take over here to steer from this moment.";
+  if (!steers()) return (pause(), say(no)); // what was asked is dropped
   stick.tapped[side] = 1;
   play();
 }
@@ -175,17 +175,20 @@ async function whatIf(action) {
   if (t === end() && over()) return say("The episode ends here. Step back, and ask again.");
   const other = await otherwise(t, action, Number($("hold").value));
   if (me !== asked) return;
-  ghost?.words === other.words ? clear() : compare(other); // the same bar again takes it away
+  ghost?.words === other.words ? clear("ghost") : compare(other); // the same bar again takes it away
 }
 function compare(other, known = "") {
   ghost = other;
+  answers.push("ghost");
   show(other.from);
   say(`${known}${other.words}: ${result(other.record)}. Esc, or the same bar, takes it away.`);
 }
-function clear() {
+function clear(name) { // an answer: the latest, if none is named
   pause();
-  [ghost, inside] = [plain, false];
-  setReasons(null);
+  const there = { inside, ghost: ghost !== plain, why: reasons, trunk: removed };
+  const last = name || answers.findLast((x) => there[x]);
+  [inside, ghost] = [inside && last !== "inside", last === "ghost" ? plain : ghost];
+  if (last === "why" || last === "trunk") setReasons(last === "trunk" ? reasons : null);
   draw();
 }
 
@@ -194,7 +197,7 @@ async function wentWrong() {
   const [me, steps] = [await settle(), Math.round(0.5 / world().dt)];
   if (me !== asked) return;
   if (!over()) return say("This episode is not over. Fly it to its end first.");
-  if (crossed(episode)) return say(`Nothing went wrong: the drone ${ended(episode)}.`);
+  if (crossed(episode)) return say(`Nothing went wrong: the drone ${ENDS[episode.record.outcome]}.`);
   let from = end();
   while (from >= steps && from > end() - 10 * steps) {
     from -= steps;
@@ -205,8 +208,8 @@ async function wentWrong() {
       if (crossed(other)) return compare(other, `Of each half second, the last way out was at ${other.at}. `);
     }
   }
-  const tried = `left, straight on and right for 0.5 s were tried at each half second from ${clock(from)} on`;
-  const nothing = `Nothing saves it: ${tried}.`;
+  const nothing = `Nothing saves it: left, straight on and right for 0.5 s were tried at each half second
+    from ${clock(from)} on.`;
   if (!isQ()) return say(nothing);
   const best = episode.moments.map(({ q }) => Math.max(...q));
   show(Math.max(nearest(best.slice(1, -1).map((x, i) => x - best[i])), 0));
@@ -218,6 +221,7 @@ async function why(trunk = null) {
   const [me, moment] = [await settle(), t];
   const answer = reasons || (await askNow("/why"));
   if (me !== asked || moment !== t) return;
+  answers.push(...(reasons ? [] : ["why"]), "trunk");
   setReasons(answer, removed && removed.trunk === trunk ? null : trunk);
   draw();
   const seen = trunk === null || answer.without.some((x) => x.trunk === trunk);
@@ -228,8 +232,8 @@ function setReasons(answer, trunk = null) {
   [reasons, removed] = [answer, answer?.without.find((x) => x.trunk === trunk) || null];
   const lead = answer && signed(above(answer.before)[answer.chosen]).slice(1);
   $("answer").innerHTML = !answer ? "" : `<p>The network ${inWords(answer.chosen)}: this ${score()} is ${lead}
-    above the mean of the nine. The numbers say how much of that is lost without one trunk: <b class="for">+
-    is a reason for</b> the turn, <b class="against">− a reason against</b> it.</p><div class="row"></div>`;
+    above the mean of the nine. What if a trunk were gone? <b class="for">+ this lead would fall by so much:
+    it speaks for this way.</b> <b class="against">− it would rise: against.</b></p><div class="row"></div>`;
   for (const x of things) {
     const button = addButton($("answer").lastChild, `${x.name} ${signed(x.weight)}`, () => why(x.trunk));
     set(button, { class: x.weight > 0 ? "for" : "against", "aria-pressed": x === removed });
@@ -297,14 +301,12 @@ function drawGround(map, { length, width, back, goal_radius }) { // the empty fo
   set(map.querySelector(".goal"), { cx: length, r: goal_radius });
 }
 function drawForest() {
-  const { length, num_actions, beacon, view } = world();
+  const { length, beacon, view } = world();
   drawGround($("map"), world());
   set($("pole"), { cx: length, r: beacon ? 0.7 : 0 });
   const edge = view * Math.tan(options.half_view);
   set($("view"), { d: `M0 0L${view} ${edge}V${-edge}Z` });
   $("trunks").innerHTML = episode.trunks.map(([x, y]) => `<circle cx="${x}" cy="${-y}"/>`).join("");
-  if ($("bars").firstChild) return;
-  for (let a = num_actions - 1; a >= 0; a--) addButton($("bars"), "", () => whatIf(a)); // left is leftmost
 }
 function draw() {
   if (learning()) return;
@@ -318,7 +320,7 @@ function draw() {
   attempt(drawInside);
   drawTime(end(), t, `${clock(t)} of ${clock(end())}`);
   const last = t === end() && over() ? result(episode.record) : "";
-  $("banner").textContent = removed ? `without: ${removed.name} (Esc puts it back)` : last;
+  $("banner").textContent = removed ? `without: ${removed.name} (${touch ? "tap it" : "Esc"}: back)` : last;
 }
 function paint(canvas, frame) {
   const grey = atob(frame);
@@ -333,6 +335,7 @@ async function drawInside() { // what the filters of the first layer find; each 
   const here = !recorded() || chosen.weights === chosen.training.replace("results/", "");
   const [moment, open] = [episode.moments[t], here && inside];
   [$("look").disabled, $("look").ariaExpanded, $("inside").hidden] = [!here, open, !open];
+  $("place-word").textContent = open ? "What the first layer finds" : "Where it is";
   if (!open || (looking && !moment.maps)) return;
   if (moment.maps) return $("maps").childNodes.forEach((canvas, i) => paint(canvas, moment.maps[i]));
   looking = askNow("/look").finally(() => (looking = null));
@@ -370,12 +373,11 @@ function drawBars() {
   const other = removed ? removed.q : q;
   const [own, without] = [above(q), above(other)];
   const reach = 2 ** Math.ceil(Math.log2(Math.max(0.1, ...[...own, ...without].map(Math.abs))));
-  $("scale").textContent = `line: the mean, ${number(mean(q))}; frame: ±${reach}`;
+  $("scale").textContent = `line: the mean, ${number(mean(q))}; top edge: ${reach} more`;
   const bar = (x, kind) =>
     `<rect class="${kind}" y="${-Math.max(x, 0) / reach}" width="1" height="${Math.abs(x) / reach}"/>`;
   [...$("bars").children].reverse().forEach((button, a) => {
-    const label = `${rate(a)} radians a second: ${score()} ${number(q[a])}. What if it turned so?`;
-    set(button, { "aria-label": label });
+    button.ariaLabel = `${rate(a)} radians a second: ${score()} ${number(q[a])}. What if it steered so?`;
     button.classList.toggle("best", q[a] === Math.max(...q));
     button.classList.toggle("flown", episode.actions[t] === String(a));
     button.innerHTML = `<span>${number(q[a])}</span><svg viewBox="0 -1 1 2" preserveAspectRatio="none">
@@ -428,8 +430,9 @@ function drawChoices() {
   }
   fill("weights", weightsOf(chosen.world), chosen.weights);
   [$("seed").value, $("stick").hidden] = [chosen.seed, !byHand()];
-  $("meaning").textContent = isQ() ? "Q: the return to expect after each turn, in rad/s." : `Scores: what the
-    expert that this network imitates would say of each turn, in rad/s (only differences count).`;
+  $("mind-word").textContent = `What ${chosen.weights} thinks`;
+  $("meaning").textContent = isQ() ? `Q: the return that ${chosen.weights} expects after each turn, in rad/s.`
+    : "Scores: what the expert that it imitates would say of each turn, in rad/s (only differences count).";
 }
 async function restore() {
   const told = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
@@ -441,7 +444,6 @@ async function restore() {
   if (told.pilot === RECORDED && training && step > 0) Object.assign(first, place, { pilot: RECORDED });
   if (!episode) chosen = first;
   if (training && !told.seed) return attempt(openLearning);
-  setView(false);
   if (await choose(first, told.actions, Math.trunc(Math.abs(Number(told.t))) || 0) || episode) return;
   const wrong = $("hint").textContent;
   if (await choose({ seed: "1", weights: "" })) say(wrong);
@@ -449,16 +451,16 @@ async function restore() {
 async function share() {
   pause();
   writeAddress();
-  const copied = await navigator.clipboard.writeText(location.href).then(() => " It is copied.", () => "");
+  const how = await navigator.clipboard.writeText(location.href).then(() => "Copied", () => "Address bar");
   const what = learning() ? "this training at this validation" : "this episode at this moment";
-  say(`The address of this page holds ${what}.${copied} It opens where a cockpit runs at ${location.host}.`);
+  say(`${how}: ${what}. It opens where a cockpit runs at ${location.host}.`);
 }
 function save() {
   pause();
   const mine = [...done.values()].filter((f) => f.world === chosen.world && f.seed < options.train_end);
   const [others, { beacon, camera }] = [done.size - mine.length, world()];
-  const left = others ? ` Left out: ${others}, of another world or of a forest from 1,000,000,000 up.` : "";
-  if (!mine.length) return say(`There is no episode to save. Fly by hand to an end in this world.${left}`);
+  const left = others ? ` Left out: ${others} (another world, or a test forest: 1,000,000,000 and up).` : "";
+  if (!mine.length) return say(`Nothing to save yet: fly a forest of this world to its end by hand.${left}`);
   const pilots = { you: { episodes: mine.map(({ world, ...record }) => record) } };
   const file = new Blob([JSON.stringify({ beacon, camera, pilots })], { type: "application/json" });
   create("a", { href: URL.createObjectURL(file), download: "episodes.json" }).click();
@@ -475,8 +477,8 @@ const actions = {
   again: () => choose({}, recorded() ? episode.actions : ""),
   random: () => choose({ seed: String(Math.floor(Math.random() * options.train_end)) }),
   take: () => choose({ pilot: "you" }, episode.actions.slice(0, over() ? Math.min(t, end() - 1) : t), t),
-  look: () => draw((inside = !inside)),
-  why: () => why(), wrong: wentWrong, learning: () => openLearning(), flying: openFlying, clear, share, save,
+  look: () => draw((inside = !inside) && answers.push("inside")), clear: () => clear(),
+  why: () => why(), wrong: wentWrong, learning: () => openLearning(), flying: openFlying, share, save,
 };
 const KEYS = { " ": "play", ",": "back", ".": "step", n: "next", r: "again", w: "why", Escape: "clear" };
 const SIDES = { ArrowLeft: "left", a: "left", ArrowRight: "right", d: "right" };
@@ -498,9 +500,10 @@ function listen() {
   window.addEventListener("blur", release);
   window.addEventListener("hashchange", restore);
   document.addEventListener("visibilitychange", () => document.hidden && (release(), pause()));
-  // What was clicked by a mouse would keep the focus, and take the keys that steer.
+  // What was clicked by a mouse, or chosen, would keep the focus, and take the keys that steer.
   const leave = ({ detail, target }) => detail && target.closest("button, [type=range]")?.blur();
   document.addEventListener("click", leave);
+  document.addEventListener("change", ({ target }) => target.matches("select, #seed") && target.blur());
   const hands = ["pointerdown", "pointerup", "pointerleave", "pointercancel"];
   for (const side of ["left", "right"])
     for (const name of hands) on(side, name, () => hold(side, name === "pointerdown"));
@@ -509,12 +512,14 @@ function listen() {
   const offer = (id, name, change) => (addButton($(id), name, () => choose(change)).title = MEANING[name]);
   for (const pilot of options.pilots) offer("pilots", pilot, { pilot });
   for (const world of Object.keys(options.worlds)) offer("worlds", world, { world, weights: "" });
+  const { num_actions } = Object.values(options.worlds)[0];
+  for (let a = num_actions - 1; a >= 0; a--) addButton($("bars"), "", () => whatIf(a)); // left is leftmost
   listenLearning(on);
   on("map", "click", clickMap);
   on("time", "input", () => go(Number($("time").value) - (learning() ? at : t)));
   on("seed", "change", () => choose({ seed: $("seed").value.trim() }));
   on("weights", "change", () => choose({ weights: $("weights").value }, recorded() ? episode.actions : ""));
-  for (const id of ["seed", "weights", "hold", "speed"]) on(id, "change", () => $(id).blur());
+  for (const word of document.querySelectorAll(".note i")) word.textContent = TAP;
 }
 
 attempt(async () => {

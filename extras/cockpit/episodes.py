@@ -21,6 +21,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
+from time import time
 from typing import Any
 
 import numpy as np
@@ -57,8 +58,7 @@ class Recording(VecForest):
         """Keep all that there is to show of the moment after a step of reward r."""
         drone, s = self.drone, self.drone.observation  # (4, 84, 84)
         moment = {"pose": drone.pose, "d_obs": drone.d_obs, "reward": r}
-        moment |= {"return": drone.episode_return}
-        moment |= {"q": self.q.values(s[None], [drone])[0].tolist()}  # A numbers
+        moment |= {"return": drone.episode_return, "q": self.q.values(s[None], [drone])[0].tolist()}
         self.moments.append(moment | {"frame": b64encode(s[-1]).decode()})
 
 
@@ -236,7 +236,9 @@ class Hangar:
         return {x.relative_to(self.root).as_posix(): x for x in sorted(found, reverse=True)}
 
     def trainings(self, ask: Any) -> list[dict[str, str]]:
-        """Those in a known world. weights: of the final network, "" if it is not here."""
+        """Those in a known world. The first is to be opened: one that runs, because its log is less
+        than 600 s old; or else the shipped one; or else the one with most validations. weights: of
+        the final network, "" if it is not here."""
         check(ask, "")
         worlds, found = {(w.beacon, w.camera): name for name, w in WORLDS.items()}, []
         for name, folder in self.folders().items():
@@ -244,8 +246,10 @@ class Hangar:
                 c, weights = settings(folder), name.removeprefix("results/")
                 world = worlds[c["beacon"], c["camera"]]
                 there = weights if weights in self.networks(world) else ""
-                found.append({"name": name, "world": world, "weights": there})
-        return found
+                new = name[:5] == "runs/" and time() - (folder / "log.csv").stat().st_mtime < 600
+                first = (new, name == "results/dqn", len(read_log(folder)))
+                found.append((first, {"name": name, "world": world, "weights": there}))
+        return [x for _, x in sorted(found, key=lambda x: x[0], reverse=True)]
 
     def training(self, ask: Any) -> dict[str, Any]:
         """The validations of a training from number `since`, and how many there are. The band: the

@@ -11,24 +11,22 @@ const learning = () => document.body.classList.contains("learning");
 const now = () => training?.validations[at];
 const lastStep = () => Math.max(training.validations.at(-1).step, training.band.at(-1)?.step[0] || 0);
 const setView = (toLearning) => (document.body.classList.toggle("learning", toLearning), pause());
-const openFlying = () => (setView(false), episode ? draw() : choose({}));
+const openFlying = () => (episode ? (setView(false), draw()) : choose({}));
 
-// Show a training at the step of `place`, or else the latest run, and its last validation.
+// Show a training, or else the server's first, at the step of its address, or else at its first validation.
 async function openLearning(name = place.training) {
-  const { step } = place;
+  const step = name === place.training && place.step;
   setView(true);
   const found = await post("/trainings", {});
   if (!found.length) throw Error("There is no training here. This begins one: python deepflight.py train");
   const known = found.find((x) => x.name === name);
   const mine = (training = { ...(known || found[0]), validations: [] });
   fill("training", found.map((x) => x.name), mine.name);
-  const parts = ["ways-word", "all-ways", "ends", "progress", "band", "clock", "named"];
-  for (const id of parts) $(id).replaceChildren();
+  "ways-word all-ways ends progress band clock named".split(" ").forEach((id) => $(id).replaceChildren());
   drawGround($("ways"), options.worlds[mine.world]);
   await learnMore();
   if (mine !== training) return;
-  const there = mine.validations.findIndex((x) => x.step === Number(step));
-  goTo(there < 0 ? Infinity : there);
+  goTo(Math.max(mine.validations.findIndex((x) => x.step === Number(step)), 0));
   if (name && !known) say(`There is no training ${name} here.`);
 }
 
@@ -57,7 +55,6 @@ async function flyEpisode(i) {
   if (!now()?.episodes[i]) return;
   const [{ seed, actions }, { world, weights }, from] = [now().episodes[i], training, place];
   options = await post("/options", {}); // the weights of a running training may be younger than the page
-  setView(false);
   await choose({ ...from, pilot: RECORDED, world, weights, seed: String(seed) }, actions);
 }
 
@@ -98,23 +95,24 @@ function drawProgress() {
   const { validations, band, others } = training;
   const share = ({ step }) => (step[0] ?? step) / lastStep(); // of the band: least and greatest
   drawLines("progress", CURVES, validations, share, at, band);
-  const words = others ? `Band: from least to greatest of those committed trainings that differ in the seed
-    alone (${others}). By chance, ${Math.round(200 / (others + 1))} % of another seed's points lie outside.`
-    : "No other committed training has these settings.";
+  const words = others ? `Grey: from the lowest to the highest of the shipped trainings that differ only in
+    their seed (${others}). Expect ${Math.round(200 / (others + 1))} % of a further seed's points outside it.`
+    : "No other shipped training has these settings.";
   $("band").textContent = `From step 0 to ${thousands(lastStep())}. ${words}`;
 }
 function nameWay(i) { // tell which episode it is; -1 is none
   const e = now()?.episodes[(named = i)];
-  $("named").textContent = e ? described(e) : "Point at a way, and it says which episode that is.";
+  $("named").textContent = e ? described(e) : touch ? "" : "Point at a way to see which episode it is.";
   set($("one-way"), { d: e ? outlineOf(e) : "M0 0", "data-end": e ? e.outcome : "" });
 }
 
 // -------------------------------------------------- pointer and keys
+const focused = () => [...$("all-ways").children].indexOf(document.activeElement);
 function pointedAt(event) {
   const { x, y } = pointed(event, $("ways"));
   const off = ({ way }) => Math.min(...way.map((p) => Math.hypot(p[0] - x, p[1] + y)));
   const far = (now()?.episodes || []).map(off);
-  return Math.min(...far) < NEAR ? nearest(far) : -1;
+  return Math.min(...far) < NEAR ? nearest(far) : focused();
 }
 function clickCurve(event) {
   const { left, width } = event.target.closest("svg")?.getBoundingClientRect() || {};
@@ -123,18 +121,18 @@ function clickCurve(event) {
 }
 function learningKey(event) {
   const ways = [...$("all-ways").children];
-  const i = ways.indexOf(event.target);
-  const fly = i >= 0 && (() => attempt(() => flyEpisode(i)));
+  const fly = named >= 0 && !event.target.matches("button") && (() => attempt(() => flyEpisode(named)));
+  const nameBy = (by) => (ways.at(named + by)?.focus(), nameWay(focused()));
   const keys = { ArrowLeft: actions.back, ArrowRight: actions.step, Enter: fly, " ": fly,
-    ArrowDown: () => ways.at(i + 1)?.focus(), ArrowUp: () => ways.at(i - 1)?.focus() };
+    ArrowDown: () => nameBy(1), ArrowUp: () => nameBy(-1) };
   if (!keys[event.key]) return;
   event.preventDefault();
   keys[event.key]();
 }
 function listenLearning(on) {
   on("ways", "pointermove", (event) => nameWay(pointedAt(event)));
-  on("ways", "pointerleave", () => nameWay(-1));
-  on("all-ways", "focusin", (event) => nameWay([...$("all-ways").children].indexOf(event.target)));
+  on("ways", "pointerleave", () => nameWay(focused()));
+  on("all-ways", "focusin", () => nameWay(focused()));
   on("ways", "click", (event) => attempt(() => flyEpisode(pointedAt(event))));
   on("progress", "click", clickCurve);
   on("training", "change", () => attempt(() => openLearning($("training").value)));

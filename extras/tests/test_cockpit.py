@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -252,6 +253,22 @@ def test_trainings_are_listed_with_their_worlds_and_final_networks(root: Path) -
         {"name": "results/dqn-9", "world": "beacon", "weights": "dqn-9"},
     ]
     assert Hangar(root / "elsewhere").trainings({}) == []
+
+
+def test_a_training_that_runs_comes_first_then_the_shipped_one_then_the_longest(
+    root: Path,
+) -> None:
+    some = network_episodes()
+    keep_training(root / "results/dqn", {5_000: some[:2]})
+    keep_training(root / "runs/long", {step: some[:2] for step in (5_000, 10_000, 15_000)})
+    keep_training(root / "runs/zero", {5_000: some[:2]})
+    for old in ("mine", "long", "zero"):
+        os.utime(root / "runs" / old / "log.csv", (0, 0))
+    names = ["results/dqn", "runs/long", "runs/mine", "runs/zero"]
+    assert [x["name"] for x in Hangar(root).trainings({})] == names
+    os.utime(root / "runs/zero/log.csv")
+    names = ["runs/zero", "results/dqn", "runs/long", "runs/mine"]
+    assert [x["name"] for x in Hangar(root).trainings({})] == names
 
 
 def test_a_training_is_told_from_any_validation_on(root: Path) -> None:

@@ -220,8 +220,8 @@ def test_a_click_on_a_trunk_takes_it_out_of_the_decision(browser: Chrome, host: 
     ActionChains(browser).move_to_element(circle).click().perform()
     until(browser, "removed")
     press(browser, Keys.ESCAPE)
-    assert value(browser, "[reasons, removed]") == [None, None]
     assert not any(value(browser, after))
+    assert value(browser, "[!!reasons, removed]") == [True, None]
 
 
 def seen_inside(browser: Chrome) -> tuple[np.ndarray, np.ndarray]:
@@ -295,6 +295,26 @@ def test_escape_brings_the_plain_ghost_back(browser: Chrome, host: str) -> None:
     value(browser, "whatIf(8)")
     value(browser, "whatIf(8)")  # the same bar again
     assert value(browser, "ghost.label") == "network"
+
+
+def test_each_escape_takes_the_latest_answer_away(browser: Chrome, host: str) -> None:
+    ways = {
+        "why": "why()", "trunk": "why(reasons.without[0].trunk)", "ghost": "whatIf(8)",
+        "inside": "$('look').click()",
+    }  # fmt: skip
+    shown = """Object.entries({ why: reasons, trunk: removed, ghost: ghost !== plain, inside })
+        .filter(([, x]) => x).map(([name]) => name)"""
+    for order in ("why trunk ghost inside", "inside ghost why trunk", "ghost why inside trunk"):
+        visit(browser, host, seed=SEED, pilot="network", t=30)
+        for name in order.split():
+            value(browser, ways[name])
+        browser.execute_script("draw()")
+        left = order.split()
+        while left:
+            assert sorted(value(browser, shown)) == sorted(left), order
+            press(browser, Keys.ESCAPE)
+            left.pop()
+        assert value(browser, shown) == []
 
 
 def saves(seed: int, actions: str, q: QNetwork) -> bool:
@@ -460,7 +480,7 @@ def test_an_episode_by_hand_that_comes_back_is_saved_once(browser: Chrome, host:
     value(browser, "choose({ pilot: 'you' }, episode.actions)")
     value(browser, "choose({ world: 'beacon', weights: '' })")
     click(browser, "save")
-    assert text(browser, "hint").startswith("There is no episode to save.")
+    assert text(browser, "hint").startswith("Nothing to save yet")
     assert "Left out: " in text(browser, "hint")
 
 
@@ -692,14 +712,14 @@ def assert_shows(browser: Chrome, episodes: list[dict]) -> None:
         assert np.allclose(line, poses[third], atol=0.0051)
 
 
-def test_the_button_shows_the_last_validation_of_a_training(
+def test_the_button_shows_the_first_validation_of_a_training(
     browser: Chrome, school: str, flown: dict[int, list[dict]]
 ) -> None:
     visit(browser, school, seed=SEED)
     click(browser, "learning")
     until(browser, "$('all-ways').children.length")
-    assert_shows(browser, flown[STEPS[2]])
-    words = "48 validation episodes after 15,000 steps, 3.0 minutes"
+    assert_shows(browser, flown[STEPS[0]])
+    words = "48 validation episodes after 5,000 steps, 1.0 minutes"
     assert text(browser, "ways-word") == words
     assert not browser.find_element(By.ID, "map").is_displayed()
     click(browser, "flying")
@@ -775,7 +795,7 @@ def test_curves_show_the_log_over_the_band_of_committed_trainings(
     bands = browser.find_elements(By.CSS_SELECTOR, "#progress .band")
     points = [len(band.get_attribute("d").split("L")) for band in bands]
     assert points == 4 * [2 * 40], "least and greatest at each of 40 steps"
-    assert "trainings that differ in the seed alone (3)" in text(browser, "band")
+    assert "trainings that differ only in their seed (3)" in text(browser, "band")
 
 
 def lone(browser: Chrome) -> tuple[int, float, float]:
@@ -807,10 +827,57 @@ def test_pointer_and_keys_name_an_episode(
     point(browser, x, y)
     assert text(browser, "named") == told(flown[STEPS[2]][i])
     press(browser, Keys.ARROW_DOWN, Keys.ARROW_DOWN)
-    assert text(browser, "named") == told(flown[STEPS[2]][1])
-    assert value(browser, "document.activeElement.ariaLabel") == told(flown[STEPS[2]][1])
+    assert text(browser, "named") == told(flown[STEPS[2]][i + 2]), "they go on from there"
+    assert value(browser, "document.activeElement.ariaLabel") == told(flown[STEPS[2]][i + 2])
     press(browser, Keys.ARROW_UP, Keys.ARROW_LEFT)
-    assert text(browser, "named") == told(flown[STEPS[1]][0]), "the same place, a step before"
+    assert text(browser, "named") == told(flown[STEPS[1]][i + 1]), "the same place, a step before"
+
+
+def test_enter_flies_the_bold_way_wherever_the_focus_is(
+    browser: Chrome, school: str, flown: dict[int, list[dict]]
+) -> None:
+    study(browser, school, step=STEPS[1])
+    press(browser, Keys.ARROW_DOWN, Keys.ARROW_DOWN)
+    curve = browser.find_element(By.CSS_SELECTOR, "#progress svg").rect
+    point(browser, curve["x"] + 2, curve["y"] + curve["height"] / 2, click=True)
+    assert value(browser, "[at, document.activeElement.tagName]") == [0, "BODY"]
+    assert text(browser, "named") == told(flown[STEPS[0]][1])
+    press(browser, Keys.ENTER)
+    until(browser, "!learning() && episode")
+    assert value(browser, "episode.record") == flown[STEPS[0]][1]
+
+
+def test_a_choice_gives_the_keys_back_and_begins_at_the_first_validation(
+    browser: Chrome, school: str, root: Path, flown: dict[int, list[dict]]
+) -> None:
+    keep_training(root / "runs/other", {step: flown[step] for step in STEPS[:2]})
+    study(browser, school, step=STEPS[1])
+    browser.find_element(By.CSS_SELECTOR, "#training option:last-child").click()
+    until(browser, "now()?.step === 5000 && training.name === 'runs/other'")
+    assert value(browser, "[training.name, at]") == ["runs/other", 0]
+    press(browser, Keys.ARROW_RIGHT)
+    assert value(browser, "[training.name, at]") == ["runs/other", 1]
+    click(browser, "flying")
+    until(browser, "!learning() && episode && ghost")
+    for name in ("weights", "hold", "speed"):
+        browser.find_element(By.ID, name).send_keys(Keys.ARROW_DOWN)
+        assert value(browser, "document.activeElement.tagName") == "BODY", name
+
+
+def test_the_old_flight_is_never_on_show_for_the_new_one(
+    browser: Chrome, school: str, flown: dict[int, list[dict]]
+) -> None:
+    visit(browser, school, seed=SEED)
+    browser.get(f"http://{school}/#training=runs/mine&step={STEPS[1]}")
+    until(browser, "learning() && now()?.step === 10000")
+    slow = "extend = (x => async (...a) => (await new Promise(f => setTimeout(f, 500)), x(...a)))"
+    browser.execute_script(f"{slow}(extend); flyEpisode(3)")
+    until(browser, "chosen.pilot === 'recorded'")
+    assert value(browser, "[learning(), episode.record.seed]") == [True, SEED]
+    until(browser, "!learning()")
+    assert value(browser, "episode.record") == flown[STEPS[1]][3]
+    total = value(browser, "clock(end())")
+    assert text(browser, "clock").endswith(f"of {total}")
 
 
 @pytest.mark.parametrize("way", ["click", "Enter"])
@@ -855,7 +922,7 @@ def test_a_recorded_way_without_its_weights_has_no_look_inside(
 def test_the_address_restores_training_and_validation_or_the_recorded_episode(
     browser: Chrome, school: str, flown: dict[int, list[dict]]
 ) -> None:
-    study(browser, school)
+    study(browser, school, step=STEPS[2])
     press(browser, Keys.ARROW_LEFT)
     click(browser, "share")
     until(browser, "$('hint').textContent.includes('this training at this validation')")
@@ -893,7 +960,7 @@ def test_a_validation_appears_while_one_looks(
     browser: Chrome, school: str, root: Path, flown: dict[int, list[dict]]
 ) -> None:
     keep_training(root / "runs/mine", {step: flown[step] for step in STEPS[:2]})
-    study(browser, school)
+    study(browser, school, step=STEPS[1])
     assert value(browser, "[at, training.validations.length]") == [1, 2]
     keep_training(root / "runs/mine", {step: flown[step] for step in STEPS[:3]})
     WebDriverWait(browser, 3, 0.05).until(lambda _: value(browser, "at === 2"))
