@@ -122,7 +122,7 @@ def main() -> None:
     with serving() as host, browsing(1000, 1020) as browser:
         image = Image.open(BytesIO(picture(browser, host))).convert("RGB")
         times = latencies(browser, host)
-    image.quantize(128).save(ROOT / "figures/cockpit.png", optimize=True)
+    image.quantize(256).save(ROOT / "figures/cockpit.png", optimize=True)
     for name, x in times.items():
         middle, late = np.percentile(x, [50, 95])
         print(f"{name}: {len(x)} times, 50 % within {middle:.1f} ms, 95 % within {late:.1f} ms")
