@@ -141,12 +141,12 @@ class Run:
         self.agent, self.replay = next(self.loop)
         if saved:
             self.restore(saved)
+        seconds = saved["seconds"] if saved else 0.0  # of training so far
+        self.began, self.lap = time.perf_counter() - seconds, (self.envs.steps, seconds)
 
     def go(self) -> int:
         """Train, validate, log and save, until the last step or a signal; returns the exit code."""
         envs, c = self.envs, self.c
-        seconds = self.log[-1]["seconds"] if self.log else 0.0
-        began, self.lap = time.perf_counter() - seconds, (envs.steps, seconds)
         self.folder.mkdir(parents=True, exist_ok=True)
         save(self.folder / "config.json", json.dumps(asdict(c), indent=2).encode())
         again = f'"{sys.executable}" {c.program}'
@@ -157,7 +157,7 @@ class Run:
                 if not np.isfinite(self.agent.loss):
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")
                 if due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
-                    self.validate(time.perf_counter() - began)
+                    self.validate()
                 if stopped and envs.steps < c.steps:
                     self.save_checkpoint()
                     print(f"saved at step {envs.steps:,}; to go on:", file=sys.stderr)
@@ -166,7 +166,7 @@ class Run:
         print(f'to fly it:\n{again} eval --weights "{self.folder}"')
         return 0
 
-    def validate(self, seconds: float) -> None:
+    def validate(self) -> None:
         """Fly the validation forests without exploring, add a row to the log, and keep the weights
         of the best score: the share that crossed (with the beacon: arrived), then, if equal, the
         progress. Their mean is kept whatever its score, because the best of many is partly luck."""
@@ -179,6 +179,7 @@ class Run:
         row = {"step": envs.steps, "episodes": len(envs.episodes), "epsilon": self.agent.epsilon}
         row |= {f"train_{key}": float(x.mean()) for key, x in recent.items()}
         row |= {f"validation_{key}": float(x.mean()) for key, x in measure(episodes).items()}
+        seconds = time.perf_counter() - self.began
         speed = (envs.steps - self.lap[0]) / (seconds - self.lap[1])  # steps a second
         self.lap = envs.steps, seconds
         self.log.append(row | {"seconds": seconds})
@@ -199,6 +200,7 @@ class Run:
         """Write the checkpoint, 34 MB. In place of the replay it holds all actions, a byte each."""
         content = {"config": asdict(self.c), "fingerprint": fingerprint(self.c), "log": self.log,
                    "validations": self.validations, "actions": self.envs.history,
+                   "seconds": time.perf_counter() - self.began,
                    "forests": self.forest_rng.bit_generator.state,
                    "rng": self.rng.bit_generator.state, "agent": self.agent.state_dict(),
                    "optimizer": self.agent.optimizer.state_dict()}  # fmt: skip
@@ -402,7 +404,7 @@ def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespac
     common["formatter_class"] = lambda prog: argparse.RawTextHelpFormatter(prog, 2, 26)
     common["description"] = __doc__.split("\n\n")[1]
     parser = argparse.ArgumentParser(**common)
-    commands = parser.add_subparsers(dest="command", required=True, metavar="train or eval")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="train, eval or -h")
     sub = commands.add_parser("train", help="train a pilot", **common)
     sub.add_argument("--name", default="", help="of the folder in runs/; default: a number")
     sub.add_argument("--resume", type=Path, help="folder of a training to go on with")
@@ -431,12 +433,12 @@ def make_run(args: argparse.Namespace, config: type[Config]) -> Run:
         free = (f"{i:03d}" for i in range(1, 10**9) if not Path(f"runs/{i:03d}").exists())
         folder = Path("runs", args.name or next(free))
         if folder.exists():
-            raise InputError(f"{folder} exists: give another --name, or go on with --resume")
+            raise InputError(f"{folder} exists: give another --name, --resume it, or delete it")
         recipe = config.beacon_recipe if given.get("beacon") else {}
         return Run(config(**recipe | given), folder)
     if args.name or given.keys() - {"steps"}:
         raise InputError(f"{args.resume} keeps its settings: only --steps may be given")
-    keys = "config fingerprint log validations actions forests rng agent optimizer"
+    keys = "config fingerprint log validations actions seconds forests rng agent optimizer"
     saved = load(args.resume / "checkpoint.pt", *keys.split())
     if (made_by := saved["fingerprint"]) != (here := fingerprint(config)):
         raise InputError(f"{args.resume} was made by {made_by}, and here is {here}")

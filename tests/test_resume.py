@@ -21,8 +21,8 @@ import dqn
 from deepflight import Config, Run, load, main
 from env import World, refly
 
-KEYS = ["config", "fingerprint", "log", "validations", "actions", "forests", "rng"]
-KEYS += ["agent", "optimizer"]
+KEYS = ["config", "fingerprint", "log", "validations", "actions", "seconds", "forests"]
+KEYS += ["rng", "agent", "optimizer"]
 SMALL = {"steps": 400, "learning_starts": 100, "replay_size": 200, "target_every": 120}
 SMALL |= {"update_every": 16, "batch_size": 8}  # the replay wraps at step 200
 WORDS = [x for key, n in SMALL.items() for x in (f"--{key.replace('_', '-')}", str(n))]
@@ -94,6 +94,8 @@ def test_ten_times_interrupted_is_uninterrupted(whole: Run, tmp_path: Path) -> N
     cuts = {8, 48, 96, 104, 160, 200, 208, 320, 360, 392}  # some after the replay has wrapped
     cut = go(tmp_path / "small", cuts)
     assert_same_training(whole.folder, cut.folder)
+    clock = [row["seconds"] for row in cut.log]
+    assert clock == sorted(clock)  # the time of all sittings
     for name in ("frames", "actions", "rewards", "ends", "added"):
         assert np.array_equal(getattr(whole.replay, name), getattr(cut.replay, name)), name
 

@@ -27,6 +27,8 @@ ENDS |= {"far": "crossed", "side": "left by a side", "back": "left by the back"}
 
 def read(folder: Path) -> tuple[World, dict[str, list[dict]]]:
     """The world, and for each of four moments a title and the episodes flown then."""
+    if not (folder / "validation.jsonl").exists():
+        sys.exit(f"growth: {folder} is no folder of a training that has validated")
     config = json.loads((folder / "config.json").read_text())
     with (folder / "log.csv").open() as file:
         minutes = {int(row["step"]): float(row["seconds"]) / 60 for row in csv.DictReader(file)}

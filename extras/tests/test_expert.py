@@ -239,8 +239,8 @@ def finish(c: Config, folder: Path, cuts: Sequence[int] = ()) -> Run:
         while run.envs.steps < cut:
             next(run.loop)
         run.save_checkpoint()
-        keys = "config", "log", "validations", "actions", "forests", "rng", "agent", "optimizer"
-        run = Run(c, folder, deepflight.load(folder / "checkpoint.pt", *keys))
+        keys = "config log validations actions seconds forests rng agent optimizer"
+        run = Run(c, folder, deepflight.load(folder / "checkpoint.pt", *keys.split()))
     assert run.go() == 0
     return run
 
