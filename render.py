@@ -198,5 +198,6 @@ def draw_panel(drone: Any, path: ndarray, q: ndarray, text: str) -> Image.Image:
         x, height = 8 + 50 * (len(q) - 1 - a), 120 * (value - q.min()) / max(np.ptp(q), 1e-9)
         colour = "royalblue" if value == q.max() else "gray"
         draw.rectangle([x, 608 - height, x + 42, 612], fill=colour)
+    draw.text((8, 618), "value of each turn, left to right", fill="black", font_size=28)
     draw.text((496, 476), text, fill="black", font_size=34, spacing=8)
     return image.reduce(2).quantize(64, Image.Quantize.FASTOCTREE)
