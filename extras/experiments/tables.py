@@ -40,6 +40,7 @@ LESSONS = {f"DQN, seed {seed}": (name, "dqn") for seed, name in enumerate(SEEDS)
     "memory, seed 1": ("memory-1", "memory"), "DRQN, seed 0": ("drqn", "drqn"),
     "DRQN, seed 1": ("drqn-1", "drqn"), "place, seed 0": ("place", "place"),
     "place, seed 1": ("place-1", "place"), "place and beacon, seed 0": ("place-beacon", "place"),
+    "place and beacon, seed 1": ("place-beacon-1", "place"),
     "the planner": ("imitation", "laser"),
 }  # fmt: skip
 
