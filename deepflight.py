@@ -25,7 +25,7 @@ A seed is a forest, and there are three sets of them:
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
 A run's folder holds config.json, log.csv, validation.jsonl (one line an episode), checkpoint.pt and
-best.pt: the best weights in validation, or in the last tenth of the steps their mean so far.
+best.pt: the best weights in validation; in the last tenth of the steps, the mean since then.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -100,15 +100,15 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     forward_reward: r pays for where the drone is and not for moving on, so a drone that circles in
     one place earns as much as one that flies past it.
     goal_bonus: arrival ends the episode, and with it all rewards. To stay near the goal for ever
-    would earn 1.25 + 0.99 * 1.25 + ... = 1.25 / (1 - 0.99) = 125 at most. So arrival earns as much:
-    1.25 + 0.99 * 125 = 125.
+    would earn 1.25 + 0.99 * 1.25 + ... = 1.25 / (1 - 0.99) = 125 at most. So arrival earns as much,
+    as if paid a step later: 1.25 + 0.99 * 125 = 125.
     far_bonus: the frames hardly show which edge is the far one, so a drone that leaves is not sure
     whether it gets -10 or -10 + 198. The bonus makes this risk worth it; 200 was found in
     validation. It changes the task: the paper counts the far edge as a crash, and here it is worth
     more than arrival. So look at the share that arrived too, and not only at that which crossed.
 
     On purpose, these parts change which way of flying is best. Parts of the form gamma * f(s2) -
-    f(s), with any f that ends at 0, would not [Ng 1999]. All printed returns leave the three out.
+    f(s), with f = 0 at an episode's end, would not [Ng 1999]. Printed returns leave the three out.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -135,7 +135,7 @@ class Run:
         self.c, self.folder, self.log, self.validations = c, folder, [], []
         self.rng = np.random.default_rng(c.seed)
         self.forest_rng = np.random.default_rng([c.seed, 1])  # apart from rng, which explores
-        seeds = iter(lambda: int(self.forest_rng.integers(TRAIN_END)), None)  # without end
+        seeds = iter(lambda: int(self.forest_rng.integers(TRAIN_END)), None)  # it never is None
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)  # dqn.train, or a lesson's
         self.agent, self.replay = next(self.loop)
@@ -169,7 +169,7 @@ class Run:
     def validate(self) -> None:
         """Fly the validation forests without exploring, add a row to the log, and keep the weights
         of the best score: the share that crossed (with the beacon: arrived), then, if equal, the
-        progress. Their mean is kept whatever its score, because the best of many is partly luck."""
+        progress. The last tenth's mean is always kept, because the best of many is partly luck."""
         envs, averaged = self.envs, self.agent.averaged.n_averaged > 0
         # best.pt keeps half precision, so fly what it will hold.
         q = copy.deepcopy(self.agent.averaged.module if averaged else self.agent.q).half().float()

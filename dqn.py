@@ -28,7 +28,7 @@ single possible action, and let all Q be 0 at first. Each update sets all three 
 The truth moves backwards. Three things can go wrong, and DQN has an answer to each:
   * Steps that follow each other are alike (correlated samples), and a network that learns from them
     in that order forgets the rest. So a **replay** buffer keeps transitions, and each update draws
-    some at random. Older, worse agents flew them, and they still serve: y takes the best a2, not
+    some at random. Flights of older, worse agents still serve, because y takes the best a2, not
     the one that was flown (Q-learning is off-policy; but see `window`).
   * Each update of Q would also move its own targets, in a chase without end. So they come from a
     **target network** Q^, a copy of Q that is synced only now and then.
@@ -237,7 +237,7 @@ class Replay:
         """
         rows, envs = (row[:, None] + np.arange(n)) % self.rows, env[:, None]  # (B, n), (B, 1)
         live = self.ends[rows, envs] == LIVE  # (B, n)
-        # reached: 1 up to the step that ends the episode, then 0. In the example of the class, row
+        # reached: 1 while all earlier steps are live, then 0. In the example of the class, row
         # 1 with n = 3: live 1 0 1, so reached 1 1 0, count 2, and the last row is 2.
         reached = np.cumprod(np.insert(live[:, :-1], 0, True, 1), 1, np.float32)  # (B, n)
         discounts = np.float32(gamma) ** np.arange(n, dtype=np.float32)  # (n,)
@@ -278,7 +278,7 @@ def mirror(b: Batch, actions: int, rng: np.random.Generator) -> Batch:
 
 class Agent(nn.Module):
     """What learning changes: Q, the target network Q^, the optimizer, and the mean of Q's weights
-    (Algorithm 1, lines 2 and 3: see `train`).
+    (Algorithm 1, lines 2 and 3). channels_last and fused only make it quicker.
 
     [+swa_fraction] Each update changes how Q flies, for better or worse. The mean of the weights
     over many updates is steadier (stochastic weight averaging), so it is what flies in the end.

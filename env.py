@@ -126,7 +126,7 @@ class Drone:
     """
 
     def __init__(self, world: World) -> None:
-        self.world, self.outcome = world, "not reset"  # as if ended: reset_done begins
+        self.world, self.outcome = world, "not reset"  # so reset_done will reset it
 
     def reset(self, seed: int) -> None:
         """Plant forest number `seed`, and stand at the start. ValueError if it is negative."""
@@ -216,7 +216,7 @@ class VecForest:
         """One control step of the active drones; actions: one for each, in order.
 
         Returns the new observations (E, 4, 84, 84), rewards (E,), terminated (E,), truncated (E,),
-        and the drones that flew: `active` now lacks those that ended.
+        and the drones that flew, also those that just ended.
         """
         drones = self.active
         r = np.array([drone.step(a) for drone, a in zip(drones, actions, strict=True)])  # (E,)

@@ -5,7 +5,7 @@ others. One ray in the ground plane finds it. A camera is 84 rays, and no 3D eng
 
     seen from above                              the same trunk in the frame
 
-       left (y)                                        column 41.5
+       left (y)                                         the middle
           |            .-'  bearing +45 deg      row 0  +-----+-----+
           |         .-'                                 | sky |     |
           |      .-'    ( )  trunk                      |  ## |     |
@@ -35,7 +35,7 @@ A pinhole camera has two rules:
   * Column i looks to the left by a bearing with tan(bearing) = (41.5 - i) / 42. So the columns are
     equally spaced on the flat image, and not in angle.
   * Row i, at depth z, looks at a point (41.5 - i) / 42 * z metres above the camera. Depth is
-    measured straight ahead. With the distance along the ray, a wall's straight top would bend.
+    measured straight ahead: with the distance along the ray, a wall's straight top would bend.
 The trunk of the example is 9.6 m away. Its top is 4 m higher than the camera, its foot 2 m lower,
 so it fills the rows from 41.5 - 42 * 4 / 9.6 = 24.0 to 41.5 + 42 * 2 / 9.6 = 50.25.
 
@@ -106,7 +106,7 @@ def raycast(centres: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray
     half_chord = np.sqrt(np.where(hit, radius**2 - across**2, 0.0))  # (N, M) m
     distance = np.where(hit, along - half_chord, np.inf)  # (N, M) m
     nearest = distance.min(0, initial=np.inf)  # (M,) m
-    half_chord[distance > nearest] = 0.0  # the nearest's stays; misses have 0
+    half_chord[distance > nearest] = 0.0  # the nearest's is left for max
     return nearest, half_chord.max(0, initial=0.0) / radius
 
 

@@ -2,6 +2,8 @@
 
     .venv/bin/python -m extras.cockpit              # then open the address that it prints
     .venv/bin/python -m extras.cockpit --port N     # at another port
+    .venv/bin/python -m extras.cockpit --runs DIR   # with one more folder of trainings, like runs/
+    .venv/bin/python -m extras.cockpit --weights FILE   # begin with this network, or a run's folder
     .venv/bin/python DIR/extras/cockpit             # from any directory
 
 A web page on this machine, for this machine. It needs no package but the core's. episodes.py has
@@ -108,11 +110,13 @@ def main(argv: list[str] | None = None) -> int:
 
         parser = argparse.ArgumentParser(prog="extras.cockpit", usage=argparse.SUPPRESS)
         parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"default: {PORT}")
-        port = parser.parse_args(argv).port
+        parser.add_argument("--runs", default="", metavar="DIR", help="more trainings, like runs/")
+        parser.add_argument("--weights", default="", metavar="FILE", help="a network, or its run")
+        args = parser.parse_args(argv)
         try:
-            server = Server(port, Hangar())
+            server = Server(args.port, Hangar(runs=args.runs, weights=args.weights))
         except (OSError, OverflowError) as error:
-            raise ValueError(f"port {port}: {error}; --port 0 takes any free one") from None
+            raise ValueError(f"port {args.port}: {error}; --port 0 takes any free one") from None
         print(f"the cockpit is at {server.ours[0]}/ (Ctrl-C ends it)", flush=True)
         server.serve_forever()
     except KeyboardInterrupt:

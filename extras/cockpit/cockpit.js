@@ -332,7 +332,7 @@ function paint(canvas, frame) {
 }
 async function drawInside() { // what the filters of the first layer find; each moment is asked for once
   // A recorded way shows it only with the weights of its own training.
-  const here = !recorded() || chosen.weights === chosen.training.replace("results/", "");
+  const here = !recorded() || chosen.weights === chosen.training.replace(/^results\//, "");
   const [moment, open] = [episode.moments[t], here && inside];
   [$("look").disabled, $("look").ariaExpanded, $("inside").hidden] = [!here, open, !open];
   $("place-word").textContent = open ? "What the first layer finds" : "Where it is";
@@ -369,8 +369,7 @@ function drawTrunks() {
   [...$("trunks").children].forEach((circle, i) => colour(circle, found.get(i), 1.2 * world().trunk_radius));
 }
 function drawBars() {
-  const { q } = episode.moments[t];
-  const other = removed ? removed.q : q;
+  const [{ q }, { q: other }] = [episode.moments[t], removed || episode.moments[t]];
   const [own, without] = [above(q), above(other)];
   const reach = 2 ** Math.ceil(Math.log2(Math.max(0.1, ...[...own, ...without].map(Math.abs))));
   $("scale").textContent = `line: the mean, ${number(mean(q))}; top edge: ${reach} more`;
@@ -437,7 +436,7 @@ function drawChoices() {
 async function restore() {
   const told = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
   const { training, step, weights, seed = "1" } = told;
-  const first = { pilot: "you", world: Object.keys(options.worlds)[0], seed, weights };
+  const first = { pilot: "you", world: options.world, seed, weights };
   if (options.pilots.includes(told.pilot)) first.pilot = told.pilot;
   if (weightsOf(told.world).length) first.world = told.world;
   if (training) place = { training, step };
@@ -501,8 +500,7 @@ function listen() {
   window.addEventListener("hashchange", restore);
   document.addEventListener("visibilitychange", () => document.hidden && (release(), pause()));
   // What was clicked by a mouse, or chosen, would keep the focus, and take the keys that steer.
-  const leave = ({ detail, target }) => detail && target.closest("button, [type=range]")?.blur();
-  document.addEventListener("click", leave);
+  document.addEventListener("click", (e) => e.detail && e.target.closest("button, [type=range]")?.blur());
   document.addEventListener("change", ({ target }) => target.matches("select, #seed") && target.blur());
   const hands = ["pointerdown", "pointerup", "pointerleave", "pointercancel"];
   for (const side of ["left", "right"])
@@ -512,8 +510,7 @@ function listen() {
   const offer = (id, name, change) => (addButton($(id), name, () => choose(change)).title = MEANING[name]);
   for (const pilot of options.pilots) offer("pilots", pilot, { pilot });
   for (const world of Object.keys(options.worlds)) offer("worlds", world, { world, weights: "" });
-  const { num_actions } = Object.values(options.worlds)[0];
-  for (let a = num_actions - 1; a >= 0; a--) addButton($("bars"), "", () => whatIf(a)); // left is leftmost
+  for (let a = options.worlds.plain.num_actions; a--; ) addButton($("bars"), "", () => whatIf(a)); // 8 to 0
   listenLearning(on);
   on("map", "click", clickMap);
   on("time", "input", () => go(Number($("time").value) - (learning() ? at : t)));

@@ -36,6 +36,8 @@ from render import BEARINGS, draw_frame, seen_from
 
 ROOT = Path(__file__).parents[2]
 WORLDS = {"plain": World(), "beacon": World(beacon=True), "disparity": World(camera="disparity")}
+EPISODE = {"seed": int, "actions": str, "outcome": str, "return": float, "steps": int}
+HOMES = {world: name for name, world in WORLDS.items()}
 CURVES = ("return", "steps", "crossed", "crash")  # what the page draws of each validation
 BROKEN = (OSError, ValueError, TypeError, KeyError, csv.Error)  # what a foreign file raises
 
@@ -62,14 +64,13 @@ class Recording(VecForest):
         self.moments.append(moment | {"frame": b64encode(s[-1]).decode()})
 
 
-def repeatable_random(s: ndarray, envs: Recording) -> ndarray:
+def same_random(s: ndarray, envs: Recording) -> ndarray:
     """A random action, but the same one each time that this moment is asked for."""
     return random_pilot(np.random.default_rng([envs.drone.seed, len(envs.moments)]))(s, envs)
 
 
 PILOTS: dict[str, Pilot] = {"network": lambda s, envs: [int(np.argmax(envs.moments[-1]["q"]))]}
-PILOTS |= {"laser": laser_pilot(Config.gamma), "random": repeatable_random}
-PILOTS |= {"straight": straight_pilot}
+PILOTS |= {"laser": laser_pilot(Config.gamma), "random": same_random, "straight": straight_pilot}
 
 # What may be asked, as patterns.
 LEGAL = dict.fromkeys(("more", "since", "time"), "[0-9]{1,4}")
@@ -98,11 +99,9 @@ def read_network(path: Path, _changed: int) -> tuple[QNetwork | None, World | No
 
 
 def settings(folder: Path) -> dict[str, Any]:
-    """Of a training, without those that leave its curve comparable; {} if they cannot be read."""
-    with suppress(*BROKEN):
-        found = dict(json.loads((folder / "config.json").read_text()))
-        return {key: value for key, value in found.items() if key not in ("seed", "threads")}
-    return {}
+    """Of a training, without those that leave its curve comparable."""
+    found = dict(json.loads((folder / "config.json").read_text()))
+    return {key: value for key, value in found.items() if key not in ("seed", "threads")}
 
 
 def read_log(folder: Path) -> list[dict[str, float]]:
@@ -117,32 +116,44 @@ def read_log(folder: Path) -> list[dict[str, float]]:
 def read_training(folder: Path, _changed: int) -> list[dict[str, Any]]:
     """The same with the episodes. The log is written first: its last row may have none yet."""
     flown: dict[int, list] = {}
-    for line in (folder / "validation.jsonl").read_text().splitlines():
-        x = json.loads(line)
+    for x in map(json.loads, (folder / "validation.jsonl").read_text().splitlines()):
         if x["outcome"] not in OUTCOMES or not re.fullmatch(LEGAL["actions"], x["actions"]):
-            raise ValueError(f"no such episode: {line[:80]}")
-        kept = {"seed": int(x["seed"]), "steps": int(x["steps"]), "return": float(x["return"])}
-        flown.setdefault(x["step"], []).append(
-            {**kept, "actions": x["actions"], "outcome": x["outcome"]}
-        )
+            raise ValueError(f"no such episode: {str(x)[:80]}")
+        flown.setdefault(x["step"], []).append({key: of(x[key]) for key, of in EPISODE.items()})
     return [x | {"episodes": flown[x["step"]]} for x in read_log(folder) if x["step"] in flown]
 
 
 class Hangar:
     """The networks and trainings in two folders each, and the last episodes. One thread at a time
-    may ask it."""
+    may ask it.
 
-    def __init__(self, root: Path = ROOT) -> None:
+    runs: one more folder of trainings. weights: one more network, a file or a run's folder; it is
+    the first of its world, and the page begins there. InputError if there are no such ones.
+    """
+
+    def __init__(self, root: Path = ROOT, runs: str = "", weights: str = "") -> None:
         torch.set_num_threads(1)  # more gain nothing on so few frames
-        self.root, self.recordings = root, []
+        self.root, self.recordings, self.world, self.given = root.resolve(), [], "plain", {}
+        self.runs = {self.root / "runs", Path(runs).resolve() if runs else self.root / "runs"}
+        if weights:
+            path, self.world = Path(weights).resolve(), HOMES.get(load_weights(weights)[1], "")
+            name, file = (path.name, path / "best.pt") if path.is_dir() else (path.stem, path)
+            ours = self.root / f"weights/{name}.pt"  # another one of this name
+            self.given = {str(path) if ours.exists() and ours != file else name: file}
+        if not (Path(runs).is_dir() and self.world):
+            raise InputError(f"{runs} is no folder" if self.world else f"{weights}: unknown world")
+
+    def name(self, folder: Path) -> str:
+        """Of a training: its path, from the root if it is there."""
+        return folder.as_posix().removeprefix(f"{self.root.as_posix()}/")
 
     def networks(self, world: str) -> dict[str, tuple[QNetwork, str]]:
         """Those of this world and their pilots' names, from weights/*.pt and runs/*/best.pt."""
         paths = {path.stem: path for path in self.root.glob("weights/*.pt")}
-        paths |= {f"runs/{path.parent.name}": path for path in self.root.glob("runs/*/best.pt")}
+        paths |= {self.name(x.parent): x for runs in self.runs for x in runs.glob("*/best.pt")}
         found = {}
-        for name, path in sorted(paths.items()):
-            q, home, pilot = read_network(path, path.stat().st_mtime_ns)
+        for name, path in (self.given | dict(sorted(paths.items())) | self.given).items():
+            q, home, pilot = read_network(path, path.exists() and path.stat().st_mtime_ns)
             found |= {name: (q, pilot)} if home == WORLDS[world] else {}
         return found
 
@@ -152,11 +163,10 @@ class Hangar:
         q, _ = self.networks(ask["world"]).get(ask["weights"], (None, ""))
         if q is None:
             raise ValueError(f"there are no weights {ask['weights']!r} of world {ask['world']}")
-        seed, actions = int(ask["seed"]), [int(action) for action in ask["actions"]]
+        seed, actions, world = int(ask["seed"]), [*map(int, ask["actions"])], WORLDS[ask["world"]]
         same = [x for x in self.recordings if (x.q, x.drone.seed) == (q, seed)]
         begun = [x for x in same if x.drone.actions == actions[: len(x.drone.actions)]]
-        recording = max(begun, key=lambda x: len(x.moments), default=None)
-        recording = recording or Recording(q, WORLDS[ask["world"]], seed)
+        recording = max(begun, key=lambda x: len(x.moments), default=0) or Recording(q, world, seed)
         for action in actions[len(recording.drone.actions) :]:
             if recording.drone.outcome:
                 raise ValueError(f"the episode ends after {len(recording.moments) - 1} actions")
@@ -167,23 +177,20 @@ class Hangar:
 
     def options(self, ask: Any) -> dict[str, Any]:
         """What one may choose from, and the numbers of each world that the page draws with.
-        half_view: rad, from ahead to the left edge of a frame."""
+        world: the one to begin in. half_view: rad, from ahead to the left edge of a frame."""
         check(ask, "")
-        worlds = {}
-        for name, world in WORLDS.items():
-            weights = {x: pilot for x, (_, pilot) in self.networks(name).items()}
-            worlds[name] = vars(world) | {"weights": weights}
+        weights = {w: {x: pilot for x, (_, pilot) in self.networks(w).items()} for w in WORLDS}
+        worlds = {name: vars(world) | {"weights": weights[name]} for name, world in WORLDS.items()}
         return {"worlds": worlds, "pilots": ["you", *PILOTS], "half_view": float(BEARINGS[0]),
-                "train_end": TRAIN_END}  # fmt: skip
+                "train_end": TRAIN_END, "world": self.world}  # fmt: skip
 
     def fly(self, ask: Any) -> dict[str, Any]:
         """Fly the actions, then let the pilot fly `more` steps, or to the end. Returns the record
         as `eval --json` writes it, the trunks, and the moments from `since`."""
         check(ask, "world weights seed actions pilot more since")
         recording, pilot = self.find(ask), PILOTS[ask["pilot"]]
-        for _ in range(int(ask["more"])):
-            if recording.drone.outcome:
-                break
+        last = len(recording.moments) + int(ask["more"])
+        while len(recording.moments) < last and not recording.drone.outcome:
             recording.fly(int(pilot(recording.drone.observation[None], recording)[0]))
         drone, moments = recording.drone, recording.moments[int(ask["since"]) :]
         return {"record": drone.episode(), "trunks": drone.trunks.tolist(), "moments": moments}
@@ -231,23 +238,23 @@ class Hangar:
 
     def folders(self) -> dict[str, Path]:
         """Those of trainings that keep their validation episodes, the latest run first."""
-        logs = [*self.root.glob("runs/*/log.csv"), *self.root.glob("results/**/log.csv")]
+        logs = [x for y in (*self.runs, self.root / "results") for x in y.glob("**/log.csv")]
         found = [path.parent for path in logs if path.with_name("validation.jsonl").exists()]
-        return {x.relative_to(self.root).as_posix(): x for x in sorted(found, reverse=True)}
+        return {self.name(x): x for x in sorted(found, reverse=True)}
 
     def trainings(self, ask: Any) -> list[dict[str, str]]:
         """Those in a known world. The first is to be opened: one that runs, because its log is less
         than 600 s old; or else the shipped one; or else the one with most validations. weights: of
         the final network, "" if it is not here."""
         check(ask, "")
-        worlds, found = {(w.beacon, w.camera): name for name, w in WORLDS.items()}, []
+        found = []
         for name, folder in self.folders().items():
             with suppress(*BROKEN):
                 c, weights = settings(folder), name.removeprefix("results/")
-                world = worlds[c["beacon"], c["camera"]]
+                world = HOMES[World(beacon=c["beacon"], camera=c["camera"])]
                 there = weights if weights in self.networks(world) else ""
-                new = name[:5] == "runs/" and time() - (folder / "log.csv").stat().st_mtime < 600
-                first = (new, name == "results/dqn", len(read_log(folder)))
+                mine, age = weights == name, time() - (folder / "log.csv").stat().st_mtime
+                first = (mine and age < 600, name == "results/dqn", len(read_log(folder)))
                 found.append((first, {"name": name, "world": world, "weights": there}))
         return [x for _, x in sorted(found, key=lambda x: x[0], reverse=True)]
 
@@ -291,13 +298,10 @@ def whereabouts(i: int, pose: ndarray, trunks: ndarray) -> str:
     if i < 0:
         return "the goal's pole"
     ahead, left = seen_from(pose, trunks[i])
-    side = "left" if left > 0 else "right"
-    return f"{np.hypot(ahead, left):.0f} m off, {abs(left):.1f} m {side}"
+    return f"{np.hypot(ahead, left):.0f} m off, {abs(left):.1f} m {'left' if left > 0 else 'right'}"
 
 
 def box(changed: ndarray) -> list[int]:
     """Left, top, width and height of what changed in a frame (84, 84); [] if nothing did."""
-    if not changed.any():
-        return []
-    low, high = [f(np.argwhere(changed)[:, ::-1], axis=0) for f in (np.min, np.max)]  # x, y
-    return [*low.tolist(), *(high - low + 1).tolist()]
+    x, y = [np.flatnonzero(changed.any(axis)).tolist() for axis in (0, 1)]
+    return [x[0], y[0], x[-1] - x[0] + 1, y[-1] - y[0] + 1] if x else []

@@ -120,9 +120,8 @@ function clickCurve(event) {
   if (width) goTo(nearest(training.validations.map(({ step }) => Math.abs(step / lastStep() - share))));
 }
 function learningKey(event) {
-  const ways = [...$("all-ways").children];
   const fly = named >= 0 && !event.target.matches("button") && (() => attempt(() => flyEpisode(named)));
-  const nameBy = (by) => (ways.at(named + by)?.focus(), nameWay(focused()));
+  const nameBy = (by) => ([...$("all-ways").children].at(named + by)?.focus(), nameWay(focused()));
   const keys = { ArrowLeft: actions.back, ArrowRight: actions.step, Enter: fly, " ": fly,
     ArrowDown: () => nameBy(1), ArrowUp: () => nameBy(-1) };
   if (!keys[event.key]) return;

@@ -195,6 +195,44 @@ def test_weights_are_those_of_two_folders_and_each_has_its_world(tmp_path: Path)
     assert Hangar(tmp_path / "runs").options({})["worlds"]["disparity"]["weights"] == {}
 
 
+def offered(hangar: Hangar) -> tuple[str, list[str]]:
+    """The world to begin in, and its weights in their order."""
+    options = hangar.options({})
+    return options["world"], list(options["worlds"][options["world"]]["weights"])
+
+
+def test_given_weights_are_the_first_of_their_world_under_a_name_of_their_own(
+    tmp_path: Path,
+) -> None:
+    for file in ("weights/a.pt", "weights/b.pt", "elsewhere/b.pt", "elsewhere/z.pt",
+                 "elsewhere/v1.5/best.pt"):  # fmt: skip
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        save_weights(tmp_path / file, QNetwork(9), Config(beacon="weights" not in file))
+    save_weights(tmp_path / "weights/c.pt", QNetwork(9), Config(beacon=True))
+    away = tmp_path.resolve() / "elsewhere"
+    assert offered(Hangar(tmp_path)) == ("plain", ["a", "b"])
+    assert offered(Hangar(tmp_path, weights=f"{away}/z.pt")) == ("beacon", ["z", "c"])
+    assert offered(Hangar(tmp_path, weights=f"{away}/v1.5")) == ("beacon", ["v1.5", "c"])
+    assert offered(Hangar(tmp_path, weights=f"{away}/b.pt")) == ("beacon", [f"{away}/b.pt", "c"])
+    assert offered(Hangar(tmp_path, weights=f"{tmp_path}/weights/b.pt")) == ("plain", ["b", "a"])
+    hangar = Hangar(tmp_path, weights=f"{away}/z.pt")
+    (away / "z.pt").unlink()
+    assert offered(hangar) == ("beacon", ["c"])
+
+
+def test_trainings_of_another_folder_have_their_path_for_a_name(
+    root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    runs = tmp_path_factory.mktemp("foreign").resolve() / "runs"
+    keep_training(runs / "mine", {5_000: network_episodes()[:2]})
+    save_weights(runs / "mine/best.pt", QNetwork(9), Config())
+    hangar, name = Hangar(root, runs=str(runs)), f"{runs}/mine"
+    assert {x["name"]: x["weights"] for x in hangar.trainings({})} == {"runs/mine": "", name: name}
+    assert offered(hangar) == ("plain", [name])
+    assert hangar.training({"name": name, "since": "0"})["others"] == 3
+    assert hangar.training({"name": "runs/mine", "since": "0"})["count"] == 2
+
+
 def test_the_page_learns_which_weights_imitate(server: Server) -> None:
     worlds = ask(server, "/options")["worlds"]
     named = {name: pilot for world in worlds.values() for name, pilot in world["weights"].items()}
@@ -451,12 +489,18 @@ def test_ctrl_c_ends_it_in_a_line() -> None:
     assert process.returncode == 130
 
 
-def test_bad_input_is_a_line(server: Server) -> None:
+def test_bad_input_is_a_line(server: Server, tmp_path: Path) -> None:
     taken = str(server.server_port)
-    for flags in (["--port", taken], ["--port", "70000"], ["--port", "x"], ["--what"]):
+    (tmp_path / "bare").mkdir()
+    save_weights(tmp_path / "odd.pt", QNetwork(9), Config(beacon=True, camera="disparity"))
+    paths = [["--runs", "gone"], ["--runs", "README.md"], ["--weights", "gone.pt"],
+             ["--weights", "README.md"], ["--weights", str(tmp_path / "bare")],
+             ["--weights", str(tmp_path / "odd.pt")]]  # fmt: skip
+    for flags in (["--port", taken], ["--port", "70000"], ["--port", "x"], ["--what"], *paths):
         process = cockpit(*flags)
         output, error = process.communicate()
         assert (process.returncode, output, error.count("\n")) == (2, "", 1), error
+        assert flags not in paths or flags[1] in error
 
 
 def test_it_starts_as_a_script_from_any_directory(tmp_path: Path) -> None:

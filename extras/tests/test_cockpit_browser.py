@@ -23,7 +23,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 from deepflight import dqn_pilot, load_weights
 from dqn import QNetwork
 from env import Drone, World, fly, random_pilot, refly
-from extras.cockpit.episodes import ROOT
+from extras.cockpit.episodes import ROOT, Hangar
 from extras.experiments.cockpit_pictures import (
     CHROMIUM,
     DRIVER,
@@ -34,7 +34,7 @@ from extras.experiments.cockpit_pictures import (
     visit,
 )
 from extras.lessons.demonstrations import DemoConfig, read_demos
-from extras.tests.test_cockpit import keep_training, network_episodes
+from extras.tests.test_cockpit import keep_training, network_episodes, running
 from render import draw_frame
 
 if not (CHROMIUM.exists() and DRIVER.exists()):
@@ -591,8 +591,11 @@ def seen_whole(browser: Chrome, *names: str) -> bool:
     return browser.execute_script(script, names)
 
 
-def test_on_a_phone_frame_map_and_bars_stand_together_and_fingers_steer(host: str) -> None:
-    with browsing(390, 844, mobile=True) as phone:
+@pytest.mark.parametrize("width", [360, 390])
+def test_on_a_phone_frame_map_and_bars_stand_together_and_fingers_steer(
+    host: str, width: int
+) -> None:
+    with browsing(width, 844, mobile=True) as phone:
         visit(phone, host, seed=SEED)
         assert text(phone, "hint").startswith("Press ◀ left or right ▶ to take off.")
         assert seen_whole(phone, "seen", "map", "bars")
@@ -633,13 +636,19 @@ def test_on_a_phone_a_tap_on_a_frame_opens_the_look_inside_and_another_closes_it
         until(phone, "$('inside').hidden")
 
 
-@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize("width", [360, 390, 1280])
 def test_the_page_is_no_wider_than_the_window_and_the_time_line_stays_in_it(
     host: str, width: int
 ) -> None:
     with browsing(width, 844) as narrow:
         visit(narrow, host)
+        for name in ("weights", "training"):  # a name may be a whole path
+            narrow.execute_script(f"$('{name}').add(new Option('/a/long/path'.repeat(9)))")
         assert value(narrow, "document.documentElement.scrollWidth") <= width
+        toggle = "document.body.classList.toggle('learning')"
+        narrow.execute_script(toggle)
+        assert value(narrow, "document.documentElement.scrollWidth") <= width
+        narrow.execute_script(toggle)
         size = {"width": width, "height": 500, "deviceScaleFactor": 1, "mobile": False}
         narrow.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         bottom = "document.querySelector('footer').getBoundingClientRect().bottom"
@@ -1007,6 +1016,36 @@ def test_without_a_training_the_view_says_how_to_begin_one(browser: Chrome, root
         press(browser, Keys.ARROW_LEFT)
         click(browser, "flying")
         assert browser.find_element(By.ID, "map").is_displayed()
+
+
+def test_a_foreign_folder_s_network_flies_and_its_training_opens(
+    browser: Chrome, flown: dict[int, list[dict]], tmp_path: Path
+) -> None:
+    run = tmp_path.resolve() / "thesis/runs/mine"
+    keep_training(run, {step: flown[step] for step in STEPS[:2]}, beacon=True)
+    shutil.copy(ROOT / "weights/dqn-beacon.pt", run / "best.pt")
+    with running(Hangar(runs=str(run.parent), weights=str(run))) as server:
+        host = server.server_address[0] + f":{server.server_port}"
+        visit(browser, host)
+        assert value(browser, "[chosen.world, chosen.weights]") == ["beacon", "mine"]
+        assert value(browser, "$('weights').value") == "mine"
+        button(browser, "pilots", "network")
+        until(browser, "chosen.pilot === 'network' && episode && over()")
+        q, world, _ = load_weights(run)
+        assert [value(browser, "episode.record")] == fly(dqn_pilot(q), [1], world)
+        click(browser, "learning")
+        until(browser, "learning() && $('all-ways').children.length")
+        names = "[...$('training').options].map((option) => option.value)"
+        place = value(browser, names).index(str(run))
+        browser.find_elements(By.CSS_SELECTOR, "#training option")[place].click()
+        until(browser, f"training.name === '{run}' && now()?.step === {STEPS[0]}")
+        assert_shows(browser, flown[STEPS[0]])
+        value(browser, "flyEpisode(3)")
+        assert value(browser, "[chosen.weights, episode.record]") == [
+            str(run), flown[STEPS[0]][3]
+        ]  # fmt: skip
+        browser.execute_script("actions.look()")
+        assert browser.find_element(By.ID, "inside").is_displayed(), "its weights are here"
 
 
 def test_a_finger_on_a_phone_flies_an_episode(school: str, flown: dict[int, list[dict]]) -> None:
