@@ -47,7 +47,6 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, fields
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -220,7 +219,7 @@ class Run:
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state = saved["rng"]
         self.log, self.validations = saved["log"], saved["validations"]
-        if saved["config"]["steps"] != self.c.steps:  # more steps: average their own last tenth
+        if saved["config"]["steps"] != self.c.steps:  # more steps raise lr, and need a later mean
             self.agent.averaged.n_averaged.zero_()
 
 
@@ -394,8 +393,10 @@ def stop_signals() -> Iterator[list[int]]:
 
 def whole(text: str) -> int:
     """The whole number that a user typed, maybe as 1e6; ValueError if it is none."""
-    number = Fraction(text)
-    return number.numerator if number.denominator == 1 else int(text)
+    number = float(text)
+    if not number.is_integer():
+        raise ValueError
+    return int(text) if text.isdecimal() else int(number)
 
 
 def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespace:

@@ -148,6 +148,7 @@ BAD = "|fly|train now|train --batch-size many|train --gamma 1.5|train --gamma na
 BAD += "|train --camera colour|train --name taken|train --replay-size 10|train --resume nowhere"
 BAD += "|train --resume text.pt|eval --episodes 0|eval --episodes few|eval --first-seed -1"
 BAD += "|train --steps inf|train --seed nan|train --batch-size 2.5|eval --episodes 1e9"
+BAD += "|train --steps 1/0|train --steps 1e999"
 BAD += "|eval --weights nowhere.pt|eval --weights text.pt|eval --out text.pt|eval --json ."
 
 

@@ -42,7 +42,7 @@ PANELS = {  # metric -> title, factor
     "crossed": ("crossed, %", 100),
 }
 NETWORKS = {"best": "best.pt", "last": "newest weights"}
-FORESTS = range(4 * 10**9, 4 * 10**9 + 200)  # no training uses them, and nothing is chosen by them
+FORESTS = range(4 * 10**9, 4 * 10**9 + 200)  # no training uses them
 RECIPE, MNIH = ("deepflight.py",), ("-m", "extras.lessons.mnih")  # programs that train
 
 
