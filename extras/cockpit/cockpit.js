@@ -524,5 +524,5 @@ attempt(async () => {
   listen();
   await restore();
   // Not at each change, because browsers complain if the address changes many times a second.
-  setInterval(() => (learning() ? training : episode && !playing) && writeAddress(), 500);
+  setInterval(() => (learning() ? training : episode) && writeAddress(), 500);
 });

@@ -26,7 +26,6 @@ from selenium.webdriver.support.ui import WebDriverWait
 from extras.cockpit.__main__ import Server
 from extras.cockpit.episodes import ROOT, Hangar
 
-HAND = "54444444432100" + 63 * "4"  # a tap to the left, then the right key held; it crashes
 CHROMIUM, DRIVER = Path("/usr/bin/chromium"), Path("/usr/bin/chromedriver")
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",

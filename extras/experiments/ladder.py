@@ -35,7 +35,6 @@ from extras.experiments.maps import SEEDS as COLOURS
 
 ROOT = Path(__file__).parents[2]
 STEPS, SEEDS = 100_000, (0, 1)
-INTERVAL = ("value", "low", "high")
 PANELS = {  # metric -> title, factor
     "steps": ("steps of an episode", 1),
     "return": ("return by the paper's reward", 1),
@@ -156,9 +155,8 @@ def networks(folder: Path) -> dict[str, QNetwork]:
 
 def metrics(episodes: list[dict]) -> dict[str, dict]:
     """What `eval` would say of these episodes through FORESTS."""
-    found = summarize(episodes, episodes)
-    del found["longer"]  # than random episodes, which are not flown here
-    return found
+    # Not `longer`: no random episodes are flown here.
+    return {key: x for key, x in summarize(episodes, episodes).items() if key != "longer"}
 
 
 def keep(training: Training) -> None:
@@ -196,7 +194,7 @@ def draw() -> None:
         for row, (seed, found) in dots:
             colour = COLOURS[int(seed)]
             for which, face, shift in (("best", colour, 0.0), ("last", "white", 0.12)):
-                value, low, high = (factor * found[which][key][x] for x in INTERVAL)
+                value, low, high = (factor * x for x in found[which][key].values())
                 y = row + 0.26 * int(seed) - 0.19 + shift
                 panel.plot([low, high], [y, y], colour, linewidth=1)
                 label = f"seed {seed}, {NETWORKS[which]}"
@@ -205,10 +203,8 @@ def draw() -> None:
         panel.grid(alpha=0.3)
     axes[0].set_yticks(range(len(rungs)), rungs)
     axes[0].invert_yaxis()
-    handles, labels = axes[0].get_legend_handles_labels()
-    legend = dict(zip(labels, handles, strict=True))  # one entry a label
-    names = sorted(legend)
-    figure.legend([legend[x] for x in names], names, ncols=3, loc="outside lower center")
+    dots = {dot.get_label(): dot for dot in axes[0].lines if dot.get_label()[0] == "s"}
+    figure.legend(handles=[dots[x] for x in sorted(dots)], ncols=3, loc="outside lower center")
     figure.savefig(ROOT / "figures/ladder.png", dpi=100)
     print("wrote figures/ladder.png")
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import deepflight
-import env
 
 ROOT = Path(__file__).resolve().parents[2]
 LABELS = {
@@ -95,7 +94,7 @@ def front() -> str:
 def outcomes(file: str, pilot: str) -> str:
     """How the episodes of a pilot ended."""
     ended = [episode["outcome"] for episode in read(file)["pilots"][pilot]["episodes"]]
-    return ", ".join(f"{ended.count(outcome)} {outcome}" for outcome in env.OUTCOMES)
+    return ", ".join(f"{ended.count(outcome)} {outcome}" for outcome in deepflight.OUTCOMES)
 
 
 if __name__ == "__main__":
