@@ -34,13 +34,13 @@ LESSONS = {f"DQN, seed {seed}": (name, "dqn") for seed, name in enumerate(SEEDS)
     "32 demonstrations alone, seed 0": ("demonstrations-32", "demonstrations"),
     "32 demonstrations alone, seed 1": ("demonstrations-32-1", "demonstrations"),
     "imitation from disparity, seed 0": ("imitation-disparity", "imitation"),
+    "imitation from disparity, seed 1": ("imitation-disparity-1", "imitation"),
     "PQN, seed 0": ("pqn", "pqn"), "PQN, seed 1": ("pqn-1", "pqn"),
     "PQN, seed 2": ("pqn-2", "pqn"), "memory, seed 0": ("memory", "memory"),
     "memory, seed 1": ("memory-1", "memory"), "DRQN, seed 0": ("drqn", "drqn"),
     "DRQN, seed 1": ("drqn-1", "drqn"), "place, seed 0": ("place", "place"),
     "place, seed 1": ("place-1", "place"), "place and beacon, seed 0": ("place-beacon", "place"),
-    "place and beacon, seed 1": ("place-beacon-1", "place"),
-    "the planner": ("imitation", "laser"),
+    "place and beacon, seed 1": ("place-beacon-1", "place"), "the planner": ("imitation", "laser"),
 }  # fmt: skip
 
 
