@@ -133,8 +133,8 @@ class Run:
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log, self.validations = c, folder, [], []
         self.rng = np.random.default_rng(c.seed)
-        self.forest_rng = np.random.default_rng([c.seed, 1])  # apart from rng, which explores
-        seeds = iter(lambda: int(self.forest_rng.integers(TRAIN_END)), None)  # it never is None
+        self.forest_rng = np.random.default_rng([c.seed, 1])  # not rng: it explores
+        seeds = iter(lambda: int(self.forest_rng.integers(TRAIN_END)), None)  # never None
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)  # dqn.train, or a lesson's
         self.agent, self.replay = next(self.loop)
@@ -213,7 +213,7 @@ class Run:
             s2, r, terminated, truncated, drones = self.envs.step(actions)
             r = shaped_reward(r, drones, self.c)  # (L,)
             self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
-        if self.forest_rng.bit_generator.state != saved["forests"]:  # another number began
+        if self.forest_rng.bit_generator.state != saved["forests"]:  # another number of episodes
             raise InputError(f"{self.folder}: its actions lead to other episodes on this machine")
         self.agent.load_state_dict(saved["agent"])
         self.agent.optimizer.load_state_dict(saved["optimizer"])

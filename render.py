@@ -106,7 +106,7 @@ def raycast(centres: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray
     half_chord = np.sqrt(np.where(hit, radius**2 - across**2, 0.0))  # (N, M) m
     distance = np.where(hit, along - half_chord, np.inf)  # (N, M) m
     nearest = distance.min(0, initial=np.inf)  # (M,) m
-    half_chord[distance > nearest] = 0.0  # the nearest's is left for max
+    half_chord[distance > nearest] = 0.0  # only the nearest trunk's stays
     return nearest, half_chord.max(0, initial=0.0) / radius
 
 
