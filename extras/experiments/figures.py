@@ -64,6 +64,7 @@ def draw_learning(report: dict) -> None:
         axes.set_title(title, fontsize=11)
     for axes in panels[1]:
         axes.set_xlabel("control steps")
+        axes.set_xticks(ticks := range(0, 200_001, 50_000), [f"{x:,}" for x in ticks])
     figure.legend(*panels[1, 0].get_legend_handles_labels(), ncols=5, loc="outside lower center")
     finish(figure, "learning.png")
 
@@ -76,15 +77,12 @@ def draw_looks() -> None:
     pose, trunks = (43.0, -12.85, 0.19), plant(looks.FORESTS[0], World())
     for axes, (camera, name, look) in zip(panels.flat, tiles, strict=False):
         pilots = [report[pilot][name] for pilot in report if pilot.startswith(camera)]
-        shares = " / ".join(f"{100 * pilot['crossed']['value']:.0f}" for pilot in pilots)
-        frame = looks.wear(look, pose, trunks, World(camera=camera))
-        axes.imshow(frame, "gray", vmin=0, vmax=255)
+        shares = " / ".join(rf"$\bf{{{100 * x['crossed']['value']:.0f}}}$" for x in pilots)
+        axes.imshow(looks.wear(look, pose, trunks, World(camera=camera)), "gray", vmin=0, vmax=255)
         axes.set_title(f"{camera}: {name}\ncrossed {shares} %", fontsize=10)
         axes.axis("off")
-    text = "What the network sees, and the share of flights that cross: of the pilot that\n"
-    figure.suptitle(
-        text + "trained with the plain look / of the one that trained with random looks"
-    )
+    title = "What the network sees, and the % of episodes that cross: of the pilot that trained\n"
+    figure.suptitle(title + "with the plain look / of the one that trained with random looks")
     finish(figure, "transfer.png")
 
 
@@ -96,8 +94,7 @@ def main() -> None:
     q, world, name = load_weights(ROOT / "weights/dqn.pt")
     episodes = report["pilots"][name]["episodes"]
     shown = episodes[measure(episodes)["crossed"].argmax()]
-    film = ROOT / "figures/flight.gif"
-    save_film(film, shown, world, q, name)
+    save_film(ROOT / "figures/flight.gif", shown, world, q, name)
     print("wrote figures/flight.gif")
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from env import OUTCOMES, Drone, World, refly
-from extras.experiments.maps import COLOURS, draw_map, draw_ways
+from extras.experiments.maps import COLOURS, HOLLOW, draw_map, draw_ways
 
 ROOT = Path(__file__).parents[2]
 SHARES = 0.025, 0.075, 0.25, 1.0  # of the training's length, at which the four moments are
@@ -73,7 +73,8 @@ def all_ways(title: str, episodes: list[dict], world: World) -> Image.Image:
     for end in OUTCOMES:
         if count := sum(episode["outcome"] == end for episode in episodes):
             text = f"{count} {ENDS[end]}"
-            draw.circle((x + 5, 29), 5, fill=COLOURS[end])
+            inside = "white" if end in HOLLOW else COLOURS[end]
+            draw.circle((x + 5, 29), 5, inside, COLOURS[end], 2)
             draw.text((x + 13, 21), text, fill="black", font_size=13)
             x += draw.textlength(text, font_size=13) + 26
     return panel

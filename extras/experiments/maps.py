@@ -11,6 +11,7 @@ SCALE = 8  # px a metre
 MARGIN = 4.0  # m around the forest
 COLOURS = {"": "#444444", "crash": "#d55e00", "goal": "#009e73", "far": "#0072b2"}  # by the end:
 COLOURS |= {"side": "#e69f00", "back": "#cc79a7", "time": "#56b4e9"}  # Okabe and Ito's palette
+HOLLOW = ("side", "back", "time")  # their dots are rings, for those who see colours alike
 SEEDS = ("#0072b2", "#e69f00", "#009e73")  # of the same palette
 
 
@@ -39,7 +40,8 @@ def draw_ways(image: Image.Image, ways: Iterable[tuple[ndarray, str, str]]) -> I
     for path, outcome, label in ways:
         colour = COLOURS[outcome]
         draw.line([pixel(image, x, y) for x, y in path], fill=colour, width=3)
-        disc(image, *path[-1], 0.7, colour)
+        disc(image, *path[-1], 0.8, colour)
+        disc(image, *path[-1], 0.45, "white" if outcome in HOLLOW else colour)
         x, y = pixel(image, *path[-1])
         step = 18 if y < image.height / 2 else -18  # px: towards the middle until there is room
         while any(abs(x - u) < 110 and abs(y + step - v) < 18 for u, v in labels):
