@@ -25,7 +25,7 @@ A seed is a forest, and there are three sets of them:
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
 A run's folder holds config.json, log.csv, validation.jsonl (one line an episode), checkpoint.pt and
-best.pt: the best weights in validation; in the last tenth of the steps, the mean since then.
+best.pt: the weights that did best in validation; at the end, the mean over the last tenth of steps.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -99,15 +99,16 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     forward_reward: r pays for where the drone is and not for moving on, so a drone that circles in
     one place earns as much as one that flies past it.
     goal_bonus: arrival ends the episode, and with it all rewards. To stay near the goal for ever
-    would earn 1.25 + 0.99 * 1.25 + ... = 1.25 / (1 - 0.99) = 125 at most. So arrival earns as much,
-    as if paid a step later: 1.25 + 0.99 * 125 = 125.
+    would earn 1.25 + 0.99 * 1.25 + ... = 1.25 / (1 - 0.99) = 125 at most. So arrival earns the
+    same, 1.25 for the step and 125 a step later: 1.25 + 0.99 * 125 = 125.
     far_bonus: the frames hardly show which edge is the far one, so a drone that leaves is not sure
     whether it gets -10 or -10 + 198. The bonus makes this risk worth it; 200 was found in
     validation. It changes the task: the paper counts the far edge as a crash, and here it is worth
     more than arrival. So look at the share that arrived too, and not only at that which crossed.
 
     On purpose, these parts change which way of flying is best. Parts of the form gamma * f(s2) -
-    f(s), with f = 0 at an episode's end, would not [Ng 1999]. Printed returns leave the three out.
+    f(s), with f = 0 at an episode's end, would not, because discounted they add up to -f(start)
+    whatever the drone does [Ng 1999]. Printed returns leave the three out.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
     worth = {"goal": c.goal_bonus, "far": c.far_bonus}
@@ -134,7 +135,7 @@ class Run:
         self.c, self.folder, self.log, self.validations = c, folder, [], []
         self.rng = np.random.default_rng(c.seed)
         self.forest_rng = np.random.default_rng([c.seed, 1])  # not rng: it explores
-        seeds = iter(lambda: int(self.forest_rng.integers(TRAIN_END)), None)  # never None
+        seeds = iter(lambda: int(self.forest_rng.integers(TRAIN_END)), None)  # endless
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)  # dqn.train, or a lesson's
         self.agent, self.replay = next(self.loop)
@@ -267,9 +268,9 @@ def measure(episodes: list[dict]) -> dict[str, ndarray]:
 def summarize(episodes: list[dict], baseline: list[dict]) -> dict[str, dict]:
     """Every metric with its 95 % interval. baseline: random episodes through the same F forests.
 
-    The interval of a mean comes from the bootstrap: draw as many forests again, with replacement,
-    2,000 times, and see how the mean varies. A share has Wilson's, because the bootstrap of 0 %
-    would be [0, 0].
+    The interval of a mean comes from resampling (the statistician's bootstrap): draw as many
+    forests again, with replacement, 2,000 times, and see how the mean varies. A share has Wilson's,
+    because resampling 0 % would give [0, 0].
     """
     n, table, random = len(episodes), measure(episodes), measure(baseline)["steps"]
     draws = np.random.default_rng(0).integers(n, size=(2000, n))  # (2000, F)

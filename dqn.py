@@ -1,4 +1,4 @@
-"""dqn.py: all of DQN, the deep Q-network of [Mnih15]: network, replay, TD target, update, loop.
+"""dqn.py: DQN, the deep Q-network of Mnih et al. 2015 [Mnih15]: network, replay, TD target, loop.
 
 An agent gets an observation s (four frames), takes an action a (one of nine yaw rates), and gets a
 reward r and the next observation s2. The **return** is the sum of all rewards to come, where one
@@ -236,18 +236,18 @@ class Replay:
         which was often not the best one. So such a target is often too low.
         """
         rows, envs = (row[:, None] + np.arange(n)) % self.rows, env[:, None]  # (B, n), (B, 1)
-        live = self.ends[rows, envs] == LIVE  # (B, n)
-        # reached: 1 while all earlier steps are live, then 0. In the example of the class, row
-        # 1 with n = 3: live 1 0 1, so reached 1 1 0, count 2, and the last row is 2.
-        reached = np.cumprod(np.insert(live[:, :-1], 0, True, 1), 1, np.float32)  # (B, n)
+        ended = self.ends[rows, envs] != LIVE  # (B, n)
+        # reached: no earlier step has ended the episode. In the example of the class, row 1 with
+        # n = 3: ended 0 1 0, ends so far 0 1 1, reached 1 1 0, count 2, and the last row is 2.
+        reached = np.cumsum(ended, 1) - ended == 0  # (B, n)
         discounts = np.float32(gamma) ** np.arange(n, dtype=np.float32)  # (n,)
         r = (reached * discounts * self.rewards[rows, envs]).sum(1)  # (B,)
-        count = reached.sum(1).astype(int)  # (B,) rewards in r
+        count = reached.sum(1)  # (B,) rewards in r
         last = (row + count - 1) % self.rows  # (B,) the row of the last one
         end = self.ends[last, env]  # (B,)
         # Where an episode goes on, s2 stands one row later; after a crash it is never used.
         s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), env)  # (B, 4, 84, 84)
-        for i in np.flatnonzero(end == TRUNCATED):  # its newest frame is in no row
+        for i in np.flatnonzero(end == TRUNCATED):  # it lacks the newest frame
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], env[i]]]
         s, a = self.stack(row, env), self.actions[row, env]  # (B, 4, 84, 84), (B,)
         gamma_n = np.float32(gamma) ** count.astype(np.float32)  # (B,)
@@ -327,9 +327,9 @@ def learn(agent: Agent, b: Batch, c: DQNConfig) -> None:
 
     Adam, the optimizer, moves each weight by -lr * m / (sqrt(v) + eps). m = 0.9 * m + 0.1 * g is a
     running mean of its gradient g, and v of g**2, with 0.999 and 0.001 (both corrected for their
-    start at 0). m / sqrt(v) is about 1 at most, so all weights move about equally fast, and slower
-    where gradients are below eps: Rainbow's 1.5e-4 [Hessel 2018], times huber_delta, because
-    gradients may be that much larger.
+    start at 0). m / sqrt(v) is about 1 at most, so all weights move about equally fast, but slower
+    where gradients are below eps. Ours is Rainbow's eps, 1.5e-4 [Hessel 2018], times huber_delta,
+    because our gradients may be larger by this factor.
     """
     with torch.no_grad():
         q2 = agent.q_target(b.s2, c.bfloat16)  # (B, A)
@@ -362,7 +362,7 @@ def due(every: int, step: int, num_envs: int) -> int:
     return step // every - (step - num_envs) // every
 
 
-# Algorithm 1 of [Mnih15]; `train` has its numbers. phi(s): four frames, theta: weights.
+# Algorithm 1 of [Mnih15]; numbers in `train` are its lines. phi(s): four frames, theta: weights.
 #      1  initialize replay memory D to capacity N
 #      2  initialize action-value function Q with random weights theta
 #      3  initialize target action-value function Q^ with weights theta- = theta

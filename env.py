@@ -41,7 +41,7 @@ pymunk, a physics library, moves the drone and measures d_obs. An episode is a d
 function of its seed and its actions, so these two are all it takes to fly it again.
 
 Legend
-    d_obs     m, from the drone's centre to the nearest trunk's surface, at most a laser's range
+    d_obs     m, from the drone's centre to the nearest trunk's surface, at most 20
     d_goal    m, from the drone's centre to the goal
     d_max     m, the forest's length
     heading   rad, counter-clockwise from x; y points to the left
@@ -83,7 +83,7 @@ class World(Scene):
     d_neg: float = 2.0  # m, this and the next four: [DF §II-A]
     d_crash: float = 0.75  # m
     r_safe: float = 0.25
-    r_precrash: float = -5.0
+    r_precrash: float = -5.0  # r_near at d_crash
     r_crash: float = -10.0
     goal_radius: float = 3.0  # m: ours
     max_steps: int = 1000  # then the episode is truncated, authors' evaluation
@@ -126,7 +126,7 @@ class Drone:
     """
 
     def __init__(self, world: World) -> None:
-        self.world, self.outcome = world, "not reset"  # so reset_done will reset it
+        self.world, self.outcome = world, "not reset"  # counts as ended
 
     def reset(self, seed: int) -> None:
         """Plant forest number `seed`, and stand at the start. ValueError if it is negative."""
@@ -148,7 +148,7 @@ class Drone:
             raise ValueError(f"no action {action}, or the episode is over: {self.outcome!r}")
         self.actions.append(int(action))
         yaw_rate = world.yaw_rate * (2 * action / (world.num_actions - 1) - 1)  # rad/s
-        heading = self.body.angle + yaw_rate * world.dt  # rad: it turns first, then flies
+        heading = self.body.angle + yaw_rate * world.dt  # rad, after this step's turn
         self.body.velocity = world.speed * math.cos(heading), world.speed * math.sin(heading)
         self.body.angular_velocity = yaw_rate
         self.space.step(world.dt)  # pymunk moves the drone for dt seconds
@@ -189,7 +189,7 @@ class Drone:
 class VecForest:
     """A vector environment: drones side by side, each in a forest of its own.
 
-    One pass through a network can pick the actions of all. seeds: of the forests to fly through.
+    One pass through a network can pick the actions of all. seeds: one for each forest to fly.
     When they run out, a drone stays inactive after its last episode.
     """
 

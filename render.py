@@ -35,7 +35,7 @@ A pinhole camera has two rules:
   * Column i looks to the left by a bearing with tan(bearing) = (41.5 - i) / 42. So the columns are
     equally spaced on the flat image, and not in angle.
   * Row i, at depth z, looks at a point (41.5 - i) / 42 * z metres above the camera. Depth is
-    measured straight ahead: with the distance along the ray, a wall's straight top would bend.
+    distance * cos(bearing), straight ahead. Without the cosine a wall's straight top would bend.
 The trunk of the example is 9.6 m away. Its top is 4 m higher than the camera, its foot 2 m lower,
 so it fills the rows from 41.5 - 42 * 4 / 9.6 = 24.0 to 41.5 + 42 * 2 / 9.6 = 50.25.
 
@@ -116,7 +116,7 @@ def shade(grey: ndarray | float, air: ndarray | float, depth: ndarray, scene: Sc
     air: m of air before it, or 0 for the beacon, which always looks clear. The grey camera mixes
     the grey level with the sky's: the more air, the more sky, and only sky where the view ends. A
     stereo camera has two lenses, a baseline apart, which see a point in columns that differ by
-    focal length * baseline / depth: the disparity. 255 * near is our focal length * baseline.
+    focal length * baseline / depth: the disparity. Ours is 255 * near / depth, at most 255.
 
     >>> shade(0, 0, np.array([1.0, 2.0, 4.0, np.inf]), Scene(camera="disparity"))
     array([255. , 255. , 127.5,   0. ])
@@ -128,8 +128,8 @@ def shade(grey: ndarray | float, air: ndarray | float, depth: ndarray, scene: Sc
 
 @cache
 def background(scene: Scene) -> ndarray:
-    """The column (84, 1) uint8 behind all trunks: sky, and ground, where depth stands in for air. A
-    row of slope -t meets the ground at depth altitude / t."""
+    """The column (84, 1) uint8 behind all trunks: sky, and ground, where the air before a point is
+    as long as its depth. A row of slope -t meets the ground at depth altitude / t."""
     depth = np.where(SLOPES < 0, scene.altitude / np.abs(SLOPES), np.inf)[:, None]  # (84, 1) m
     return shade(scene.ground, depth, depth, scene).astype(np.uint8)
 
@@ -155,7 +155,7 @@ def draw_frame(pose: tuple, trunks: ndarray, scene: Scene) -> ndarray:
     depth = distance * COSINES  # (84,) m, straight ahead
     if scene.beacon:  # visible from any distance
         goal = seen_from(pose, np.array([[scene.length, 0.0]]))  # (1, 2) m
-        radius = max(scene.beacon_radius, scene.beacon_pixels / PIXELS * goal[0, 0])  # m
+        radius = max(scene.beacon_radius, scene.beacon_pixels / PIXELS * goal[0, 0])  # m: width / 2
         pole = raycast(goal, radius, BEARINGS)[0] * COSINES  # (84,) m, its depth
         value = shade(scene.beacon_grey, 0, pole, scene)  # (84,)
         frame = paint(frame, pole, scene.beacon_height, value, scene)
