@@ -33,9 +33,13 @@ def recipe(name: str, config: type, **changes: Any) -> type:
 
 
 def run(config: type, argv: Sequence[str]) -> int:
-    """The command line of deepflight.py, and `diff`: how a lesson's loop differs from dqn.train."""
+    """The command line of deepflight.py, and `diff`: how a lesson's loop differs from the one that
+    it builds on, which is dqn.train or that of another lesson."""
     if list(argv) != ["diff"]:
         return deepflight.main(argv, config)
-    loops = (inspect.getsource(train).splitlines() for train in (dqn.train, config.train))
-    print(*unified_diff(*loops, "dqn.train", f"{config.pilot}: train", lineterm=""), sep="\n")
+    recipes = config.__mro__[: config.__mro__.index(deepflight.Config) + 1]
+    old = next((base.train for base in recipes if base.train is not config.train), dqn.train)
+    lines = [inspect.getsource(train).splitlines() for train in (old, config.train)]
+    lines[0] = [line.replace(" [!]", "").rstrip(" #") for line in lines[0]]  # its marks, not ours
+    print(*unified_diff(*lines, f"{old.__module__}.train", "train", lineterm=""), sep="\n")
     return 0

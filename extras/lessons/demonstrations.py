@@ -30,7 +30,7 @@ second one was demonstrated, the others count as 6 and 5, 9 is more, and the los
 
 The network learns from the demonstrations alone at first, in 2,000 updates. Then it flies, and
 because it need not fly at random first, epsilon is 0.05 from the start. Its next update comes after
-5,000 steps. Later batches hold no demonstrations; with --demo-share 0.25 a quarter of each is.
+5,000 steps. Later batches hold none, or with --demo-share 0.25 a quarter.
 
 **What is different from dqn.py**, marked [!] in `train`:
     demo_replay   a second replay, for demonstrations alone
@@ -50,9 +50,10 @@ others, from trainings of an earlier version, over 200 (results/demonstrations.j
 
 In 80 steps no update is due, so the first line is what the 2,000 updates on demonstrations make.
 Its pilots fly 336 and 190 % longer than random, as dqn does after 10,000 steps. After 60,000 steps
-the lead is no larger than the spread of seeds. Demonstrations later on raised return and crashes,
-and halved crossing. Our explanation: demonstrations hold no crash, and a drone that explores little
-sees too few. With more exploring (last line) few crash, and few cross.
+they lead by 7 of return, but two seeds differ by 12. So demonstrations gave a head start and no
+more. Demonstrations later on raised return and crashes, and halved crossing. Perhaps it crashes
+because demonstrations hold no crash: with more exploring (last line) few do. Why few then cross we
+do not know.
 
 [Hester 2018]  Deep Q-learning from demonstrations, AAAI; it also has a prioritized replay
 """

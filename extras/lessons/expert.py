@@ -11,11 +11,11 @@ already. How well can a network fly that learns from this expert and not from re
 **The expert** is a planner, `plan`. It has a laser scanner and knows its pose, so it is privileged:
 the network has four frames only. The planner adds up the rewards to come along 81 candidate
 trajectories. Each holds one yaw rate for 0.6 s, then another or the same for 1.6 s. It ends early
-where it crashes, leaves the forest or arrives. The reward of step k counts gamma^k times. Where a
-trajectory does not end early, `plan` pretends that the drone then turns to the goal or to the far
-edge and flies straight there, through all trunks and without rewards, n steps from now. The better
-bonus, each times its gamma^n, is added. An action is worth what the best trajectory is worth that
-begins with it. These nine values are the scores.
+where it crashes, leaves the forest or arrives. The reward of step k counts gamma^k times. Where it
+does not end early, `plan` pretends that the drone then turns to the goal or to the far edge and
+flies straight there, through all trunks and without rewards. A bonus n steps from now counts
+gamma^n times, and the better one is added. An action is worth what the best trajectory is worth
+that begins with it. These nine values are the scores.
 
 In numbers, where arrival is worth 125 and no other bonus is paid: fly straight on from the start,
 far from trunks. The 22 steps earn 6.2. The goal is then 79 m or 158 steps away, so
@@ -49,11 +49,11 @@ whatever the observation is worth. Only with --bellman does the level of the out
     dqn                     65.6 %       2.0 %       64.4
     imitation, seed 0       88.5 %       0.3 %       83.7
     imitation, seed 1       87.2 %       0.3 %       84.1
-    the planner             98.9 %       0.0 %       88.7      (plans for arrival only)
+    the planner             98.9 %       0.0 %       88.7      (arrival alone pays)
 
 With the beacon 90.3 % arrive, at a return of 88.3 (dqn: 90.6 % at 56.9). TD targets beside the
 scores made it worse: after 60,000 steps 53.5 and 54.5 % of 200 crossed, without them 72.5 and
-73.5 % (results/demonstrations.json).
+73.5 % (results/demonstrations.json, from trainings of an earlier version).
 
 Legend, beside that of dqn.py: W candidate trajectories, T steps of each, P points that a laser sees
 [Ross 2011]  A reduction of imitation learning to no-regret online learning, AISTATS
@@ -93,7 +93,8 @@ def scan(drone: Drone) -> tuple[ndarray, ndarray]:
 
 
 def plan(bearings: ndarray, distances: ndarray, pose: tuple, world: World, c: Config) -> ndarray:
-    """The value (A,) of each action, by the rewards that c says, as the header explains.
+    """The value (A,) of each action, by the rewards that c says, as the header explains: where the
+    trajectories lead, which step ends each, the rewards up to it, and the bonus that comes after.
 
     bearings, distances (beams,): the scan. pose: x, y in m and heading in rad.
     """
@@ -168,8 +169,7 @@ ExpertBatch = namedtuple("ExpertBatch", (*dqn.Batch._fields, "scores"))
 
 def consult(envs: VecForest, c: Config) -> None:
     """Let `envs.reset_done` also keep, in `envs.scores` (L, A), what the expert says of the
-    observations that it returns. Resuming calls it before each step too, so the scores come out
-    the same."""
+    observations that it returns. Resuming refills the replay through it, with the same scores."""
     reset_done = envs.reset_done
 
     def reset_and_score() -> ndarray:
@@ -250,7 +250,7 @@ def train(c: "ExpertConfig", envs: VecForest, rng: Generator, shaped: Callable) 
         agent.optimizer.param_groups[0]["lr"] = lr
         s = envs.reset_done()  # 4, 5, 6 (L, 4, 84, 84)
         explore = rng.random(c.num_envs) < agent.epsilon  # 7 (L,)
-        rng.integers(envs.num_actions, size=c.num_envs)  # [!] drawn as in dqn.py, but not flown
+        rng.integers(envs.num_actions, size=c.num_envs)  # [!] unused; keeps rng as in dqn.py
         best = envs.scores.argmax(1)  # (L,) [!]
         a = np.where(explore, best, agent.q.values(s, envs.drones).argmax(1))  # 8 (L,) [!]
         s2, r, terminated, truncated, drones = envs.step(a)  # 9, 10

@@ -17,8 +17,9 @@ numbers by dead reckoning, which join the features of the convolutions.
 In numbers: an edge is 8 m ahead, and no trunk is near. At the far edge (x = 82, y = 15) the planner
 scores straight on 112.3 and the sharpest right turn 112.5. Either will do, because it can still
 leave a second later. At the left edge (x = 40, y = 17) it scores them 4.0 and 58.4. Four frames are
-the same in both places, so the network learns the mean of both labels, which says: turn. It does so
-at every edge, and again a second later. With the place these are two inputs, each with its label.
+the same in both places, so the network learns the mean of both labels: straight on is worse by
+(0.2 + 20) / 2 = 10, because imitation_loss cuts differences at 20. So it turns at every edge, and
+again a second later. With the place these are two inputs, each with its label.
 
 **What differs from expert.py**
     QNetwork     that of memory.py
@@ -35,13 +36,13 @@ at every edge, and again a second later. With the place these are two inputs, ea
     imitation, seed 1        20.1 %    87.2 %       0.3 %       84.1         200,000
     place, seed 0            33.0 %    97.9 %       0.4 %       81.6          60,000
     place, seed 1            42.9 %    96.7 %       1.7 %       81.5          60,000
-    the planner              98.4 %    98.9 %       0.0 %       88.7    (plans for arrival only)
+    the planner              98.4 %    98.9 %       0.0 %       88.7    (arrival alone pays)
 
 Most of the gap is closed. Normalized layers and RAdam came along, so there is a control: with four
 zeros for the place, one training crossed 81 % of 48 validation forests in the end, where both
 trainings with the place crossed 98 % or more (results/place-blind, place, place-1). So what
-imitation lacked was information. The labels pay 115 for the far edge, so more episodes leave there
-than arrive.
+imitation lacked was information more than practice. The labels pay 115 for the far edge, so more
+episodes leave there than arrive.
 
 With a drift of 10 degrees a minute seed 0 crosses 95 % [89, 98] of 100 validation forests (`place
 drift eval --weights weights/place.pt --first-seed 1000000048 --episodes 100`). With the beacon,
@@ -90,7 +91,7 @@ class PlaceReplay(ExpertReplay):
 
 
 def mirror(b: PlaceBatch, actions: int, rng: Generator) -> PlaceBatch:
-    """expert.mirror, where the sine and y change their sign too."""
+    """expert.mirror of what `learn` reads; the sine and y change their sign."""
     flip = torch.from_numpy(rng.random(len(b.a)) < 0.5)  # (B,)
     for x in (b.s, b.scores):
         x[flip] = x[flip].flip(-1)
@@ -126,7 +127,7 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
         replay.add(s, a, shaped(r, drones, c), s2, terminated, truncated)  # 11
         updates = due(c.update_every, step, c.num_envs) if step >= c.learning_starts else 0
         for _ in range(updates):
-            batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12
+            batch = replay.sample(c.batch_size, c.n_steps, c.gamma, rng)  # 12 [+n_steps]
             batch = mirror(batch, envs.num_actions, rng) if c.mirror else batch  # [+mirror]
             learn(agent, batch, c)  # 13, 14 [!]
             if c.swa_fraction and step > (1 - c.swa_fraction) * c.steps:  # [+swa_fraction]
@@ -134,7 +135,7 @@ def train(c: Config, envs: VecForest, rng: Generator, shaped: Callable) -> Itera
         yield agent, replay
 
 
-# Without effect: target_every, double, n_steps and bellman.
+# Without effect: target_every, double and bellman.
 PlaceConfig = recipe(
     "PlaceConfig", ExpertConfig,
     program="-m extras.lessons.place", pilot="place", train=staticmethod(train),

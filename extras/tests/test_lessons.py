@@ -7,22 +7,27 @@ import pytest
 import dqn
 from extras.lessons import run
 from extras.lessons.demonstrations import DemoConfig
+from extras.lessons.drqn import DRQNConfig
 from extras.lessons.expert import ExpertConfig
+from extras.lessons.memory import MemoryConfig
 from extras.lessons.mnih import MnihConfig, TextbookConfig
+from extras.lessons.place import PlaceConfig
 from extras.lessons.pqn import PQNConfig
 
+LESSONS = {ExpertConfig: "dqn", DemoConfig: "dqn", MnihConfig: "dqn", PQNConfig: "dqn"}
+LESSONS |= {MemoryConfig: "pqn", DRQNConfig: "pqn", PlaceConfig: "expert"}
 
-@pytest.mark.parametrize("config", [ExpertConfig, DemoConfig, MnihConfig, PQNConfig])
+
+@pytest.mark.parametrize("config", LESSONS)
 def test_diff_adds_no_line_to_the_loop_that_is_not_marked(
     config: type, capsys: pytest.CaptureFixture
 ) -> None:
     assert run(config, ["diff"]) == 0
-    added = [line for line in capsys.readouterr().out.splitlines() if line[0] == "+"]
-    assert added[0].startswith("+++")
-    assert added[1].startswith("+def train(c:")
-    assert added[2].lstrip("+ ").startswith('"""Algorithm 1')
-    assert added[3:]
-    assert all("[!]" in line for line in added[3:])
+    before, after, *lines = capsys.readouterr().out.splitlines()
+    assert before.endswith(f"{LESSONS[config]}.train") and after == "+++ train"
+    added = [line for line in lines if line[0] == "+" and "def train(c:" not in line]
+    assert added[0].lstrip("+ ").startswith('"""') and added[1:]
+    assert all("[!]" in line for line in added[1:])
     assert len(inspect.getsource(config.train).splitlines()) <= 45
     assert list(inspect.signature(config.train).parameters) == ["c", "envs", "rng", "shaped"]
 
