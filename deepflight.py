@@ -26,7 +26,7 @@ A seed is a forest, and there are three sets of them:
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
 A run's folder holds config.json, log.csv, validation.jsonl (one line an episode), checkpoint.pt and
-best.pt: the weights that did best in validation; at the end, the mean over the last tenth of steps.
+best.pt: the weights that did best in validation; in the last tenth of steps, their mean instead.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -108,7 +108,7 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     more than arrival. So look at the share that arrived too, and not only at that which crossed.
 
     On purpose, these parts change which way of flying is best. Parts of the form gamma * f(s2) -
-    f(s), with f = 0 at an episode's end, would not, because discounted they add up to -f(start)
+    f(s), with f = 0 at an episode's end, would not: discounted, all but -f(start) cancels,
     whatever the drone does [Ng 1999]. Printed returns leave the three out.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
@@ -219,7 +219,7 @@ class Run:
         self.agent.optimizer.load_state_dict(saved["optimizer"])
         self.rng.bit_generator.state = saved["rng"]
         self.log, self.validations = saved["log"], saved["validations"]
-        if saved["config"]["steps"] != self.c.steps:  # more steps raise lr, and need a later mean
+        if saved["config"]["steps"] != self.c.steps:  # a later last tenth: its mean begins again
             self.agent.averaged.n_averaged.zero_()
 
 
@@ -346,7 +346,7 @@ def load(path: Path | str, *keys: str) -> dict[str, Any]:
     """Read what save wrote, without running any code from the file. InputError if it cannot be
     read, is damaged, or does not hold these keys."""
     try:
-        archive = zipfile.ZipFile(path)  # checksums leave out flags, and damaged ones mislead torch
+        archive = zipfile.ZipFile(path)  # testzip leaves out flags, which mislead torch if damaged
         if archive.testzip() or any(part.external_attr for part in archive.infolist()):
             raise zipfile.BadZipFile
         content = torch.load(path, weights_only=True)

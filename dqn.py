@@ -194,7 +194,7 @@ class Replay:
 
     def __init__(self, capacity: int, num_envs: int) -> None:
         self.rows, self.num_envs = shape = (capacity // num_envs, num_envs)  # T, L
-        self.frames = np.full((*shape, 84, 84), 0, np.uint8)  # (T, L, 84, 84) takes memory at once
+        self.frames = np.full((*shape, 84, 84), 0, np.uint8)  # (T, L, 84, 84) fails now or never
         self.actions, self.ends = np.zeros(shape, np.int64), np.zeros(shape, np.uint8)  # (T, L)
         self.rewards = np.zeros(shape, np.float32)  # (T, L)
         self.last_frames: dict[tuple[int, int], ndarray] = {}  # (row, env) -> (84, 84)
@@ -232,8 +232,8 @@ class Replay:
 
         [+n_steps] With n = 2 the target of Q(s_0, a_0) is r_0 + gamma * r_1 + gamma**2 * (the
         greatest Q^ of s_2): two true rewards, so the truth moves back by two steps in each update.
-        This has a price: r_1 followed from the action in s_1, which an older agent chose, and
-        which was often not the best one. So such a target is often too low.
+        The price: an older agent chose the action in s_1, often not the best one, so such a
+        target is often too low.
         """
         rows, envs = (row[:, None] + np.arange(n)) % self.rows, env[:, None]  # (B, n), (B, 1)
         ended = self.ends[rows, envs] != LIVE  # (B, n)
@@ -245,7 +245,7 @@ class Replay:
         count = reached.sum(1)  # (B,) rewards in r
         last = (row + count - 1) % self.rows  # (B,) the row of the last one
         end = self.ends[last, env]  # (B,)
-        # Where an episode goes on, s2 stands one row later; after a crash it is never used.
+        # LIVE: s2 stands one row later. TERMINAL: it is never used. TRUNCATED: mended below.
         s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), env)  # (B, 4, 84, 84)
         for i in np.flatnonzero(end == TRUNCATED):  # it lacks the newest frame
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], env[i]]]
@@ -326,10 +326,10 @@ def learn(agent: Agent, b: Batch, c: DQNConfig) -> None:
     balance one pull of 1: 9 * (0 - Q) = 1, so Q = -0.11, and the crash is nearly ignored.
 
     Adam, the optimizer, moves each weight by -lr * m / (sqrt(v) + eps). m = 0.9 * m + 0.1 * g is a
-    running mean of its gradient g, and v of g**2, with 0.999 and 0.001 (both corrected for their
-    start at 0). m / sqrt(v) is about 1 at most, so all weights move about equally fast, but slower
-    where gradients are below eps. Ours is Rainbow's eps, 1.5e-4 [Hessel 2018], times huber_delta,
-    because our gradients may be larger by this factor.
+    running mean of its gradient g, and v = 0.999 * v + 0.001 * g**2 one of g**2 (both corrected for
+    their start at 0). m / sqrt(v) is about 1 at most, so all weights move about equally fast, but
+    slower where gradients are below eps. Ours is Rainbow's eps, 1.5e-4 [Hessel 2018], times
+    huber_delta, because our gradients may be larger by this factor.
     """
     with torch.no_grad():
         q2 = agent.q_target(b.s2, c.bfloat16)  # (B, A)

@@ -45,7 +45,7 @@ Legend
     d_goal    m, from the drone's centre to the goal
     d_max     m, the forest's length
     heading   rad, counter-clockwise from x; y points to the left
-    N, E      trunks; active drones, which are those whose episodes have not ended
+    N, E      trunks; active drones: those in the midst of an episode
     [DF]      the Deep Flight paper; "authors' simulator": its code; "ours": from neither
 
 Not in this file: rotors, wind, inertia, a change of altitude.
@@ -172,7 +172,7 @@ class Drone:
         self.observation = np.stack([*older, frame])  # (4, 84, 84)
 
     def judge(self) -> str:
-        """How the episode has ended: the first of OUTCOMES that holds, or "" in the air."""
+        """How the episode has ended: the first below that holds, or "" in the air."""
         (x, y, _), world = self.pose, self.world
         ended = {"crash": self.d_obs < world.d_crash, "goal": self.d_goal < world.goal_radius,
                  "far": x > world.length, "back": x < -world.back, "side": abs(y) > world.width / 2,
@@ -197,7 +197,7 @@ class VecForest:
         self.world, self.num_actions = world, world.num_actions
         self.drones, self.seeds = [Drone(world) for _ in range(num_envs)], iter(seeds)
         self.episodes: list[dict] = []  # all that have ended
-        self.history: list[bytes] = []  # all actions, from which deepflight.Run resumes
+        self.history: list[bytes] = []  # all actions; deepflight.Run resumes by flying them
         self.steps = 0  # control steps of all drones together
 
     @property

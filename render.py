@@ -79,7 +79,7 @@ class Scene:
     beacon: bool = False  # a pole that makes the goal visible; off in the paper's world
     beacon_height: float = 20.0  # m
     beacon_radius: float = 1.0  # m
-    beacon_pixels: float = 3.0  # px, the beacon is never drawn narrower than this
+    beacon_pixels: float = 3.0  # px, its least width; the 84 show 2 * depth metres
     camera: str = "grey"  # or "disparity"
     near: float = 2.0  # m, disparity is 255 at this depth
     sky: int = 90  # this and all below: grey levels
@@ -106,7 +106,7 @@ def raycast(centres: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray
     half_chord = np.sqrt(np.where(hit, radius**2 - across**2, 0.0))  # (N, M) m
     distance = np.where(hit, along - half_chord, np.inf)  # (N, M) m
     nearest = distance.min(0, initial=np.inf)  # (M,) m
-    half_chord[distance > nearest] = 0.0  # only the nearest trunk's stays
+    half_chord[distance > nearest] = 0.0  # so max takes the nearest trunk's
     return nearest, half_chord.max(0, initial=0.0) / radius
 
 
@@ -128,8 +128,8 @@ def shade(grey: ndarray | float, air: ndarray | float, depth: ndarray, scene: Sc
 
 @cache
 def background(scene: Scene) -> ndarray:
-    """The column (84, 1) uint8 behind all trunks: sky, and ground, where the air before a point is
-    as long as its depth. A row of slope -t meets the ground at depth altitude / t."""
+    """The column (84, 1) uint8 behind all trunks: sky and ground. The air before a point is taken
+    to be its depth. A row of slope -t meets the ground at depth altitude / t."""
     depth = np.where(SLOPES < 0, scene.altitude / np.abs(SLOPES), np.inf)[:, None]  # (84, 1) m
     return shade(scene.ground, depth, depth, scene).astype(np.uint8)
 
@@ -137,8 +137,8 @@ def background(scene: Scene) -> ndarray:
 def paint(frame: ndarray, depth: ndarray, height: float, value: ndarray, scene: Scene) -> ndarray:
     """Draw upright cylinders over a frame (84, 84) or a column (84, 1); returns (84, 84).
     depth (84,): m, of their surface, inf where there is none. value (84,): of their pixels."""
-    foot, top = -scene.altitude / depth, (height - scene.altitude) / depth  # (84,) slopes, 0 at inf
-    inside = (SLOPES[:, None] > foot) & (SLOPES[:, None] <= top)  # (84, 84)
+    foot, top = -scene.altitude / depth, (height - scene.altitude) / depth  # (84,) slopes
+    inside = (SLOPES[:, None] > foot) & (SLOPES[:, None] <= top)  # (84, 84) none at inf
     return np.where(inside, value.astype(np.uint8), frame)
 
 
@@ -155,7 +155,7 @@ def draw_frame(pose: tuple, trunks: ndarray, scene: Scene) -> ndarray:
     depth = distance * COSINES  # (84,) m, straight ahead
     if scene.beacon:  # visible from any distance
         goal = seen_from(pose, np.array([[scene.length, 0.0]]))  # (1, 2) m
-        radius = max(scene.beacon_radius, scene.beacon_pixels / PIXELS * goal[0, 0])  # m: width / 2
+        radius = max(scene.beacon_radius, scene.beacon_pixels / PIXELS * goal[0, 0])  # m
         pole = raycast(goal, radius, BEARINGS)[0] * COSINES  # (84,) m, its depth
         value = shade(scene.beacon_grey, 0, pole, scene)  # (84,)
         frame = paint(frame, pole, scene.beacon_height, value, scene)
