@@ -151,7 +151,8 @@ class Run:
         save(self.folder / "config.json", json.dumps(asdict(c), indent=2).encode())
         again = f'"{sys.executable}" {c.program}'
         with stop_signals() as stopped:
-            print(f"{c.steps:,} steps in {self.folder}; live: `python -m extras.cockpit`\n\n{HEAD}")
+            print(f"{c.steps:,} steps in {self.folder}; live: {sys.executable} -m extras.cockpit")
+            print(f"\n{HEAD}", flush=True)
             for _ in self.loop:
                 if not np.isfinite(self.agent.loss):
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")
@@ -418,7 +419,7 @@ def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespac
         text = f"{f.metadata['help']} (default: {f.default})"
         group.add_argument("--" + f.name.replace("_", "-"), help=text, **more)
     sub = commands.add_parser("eval", help="fly trained weights beside other pilots", **common)
-    shipped = Path(__file__).parent / "weights/dqn.pt"
+    shipped = Path(__file__).parent / f"weights/{config.pilot}.pt"
     sub.add_argument("--weights", type=Path, default=shipped, help="a file, or a run's folder")
     sub.add_argument("--episodes", type=whole, default=100, help="one a forest (default: 100)")
     sub.add_argument("--first-seed", type=whole, default=TEST_FIRST, help="(default: %(default)s)")
@@ -436,8 +437,9 @@ def make_run(args: argparse.Namespace, config: type[Config]) -> Run:
         folder = Path("runs", args.name or next(free))
         if folder.exists():
             raise InputError(f"{folder} exists: give another --name, --resume it, or delete it")
-        recipe = config.beacon_recipe if given.get("beacon") else {}
-        return Run(config(**recipe | given), folder)
+        c = config(**(config.beacon_recipe if given.get("beacon") else {}) | given)
+        folder.mkdir(parents=True)  # now, so that a training started meanwhile takes another
+        return Run(c, folder)
     if args.name or given.keys() - {"steps"}:
         raise InputError(f"{args.resume} keeps its settings: only --steps may be given")
     keys = "config fingerprint log validations actions seconds forests rng agent optimizer"

@@ -22,7 +22,7 @@ from extras.experiments.maps import COLOURS, HOLLOW, draw_map, draw_ways
 ROOT = Path(__file__).parents[2]
 SHARES = 0.025, 0.075, 0.25, 1.0  # of the training's length, at which the four moments are
 ENDS = {"": "in the air", "crash": "hit a trunk", "goal": "arrived", "time": "out of time"}
-ENDS |= {"far": "crossed", "side": "left by a side", "back": "left by the back"}
+ENDS |= {"far": "crossed at the far edge", "side": "left by a side", "back": "left by the back"}
 
 
 def read(folder: Path) -> tuple[World, dict[str, list[dict]]]:
