@@ -18,7 +18,6 @@ LABELS = {
     "goal": "arrived, %", "crossed": "crossed, %", "crash": "hit a trunk, %",
     "longer": "longer than random, %", "return": "return",
 }  # fmt: skip
-SEEDS = "dqn", "dqn-1", "dqn-2"
 FRONT = {  # heading -> file, pilot
     "DQN, seed 0": ("dqn", "dqn"), "seed 1": ("dqn-1", "dqn"), "seed 2": ("dqn-2", "dqn"),
     "beacon, seed 0": ("dqn-beacon", "dqn"),
@@ -28,19 +27,14 @@ FULL = {
     "imitation": ("imitation", "imitation"),
     "imitation, beacon": ("imitation-beacon", "imitation"), "laser": ("imitation", "laser"),
 }  # fmt: skip
-LESSONS = {f"DQN, seed {seed}": (name, "dqn") for seed, name in enumerate(SEEDS)} | {
-    "imitation, seed 0": ("imitation", "imitation"),
-    "imitation, seed 1": ("imitation-1", "imitation"),
-    "32 demonstrations alone, seed 0": ("demonstrations-32", "demonstrations"),
-    "32 demonstrations alone, seed 1": ("demonstrations-32-1", "demonstrations"),
-    "imitation from disparity, seed 0": ("imitation-disparity", "imitation"),
-    "imitation from disparity, seed 1": ("imitation-disparity-1", "imitation"),
-    "PQN, seed 0": ("pqn", "pqn"), "PQN, seed 1": ("pqn-1", "pqn"),
-    "PQN, seed 2": ("pqn-2", "pqn"), "memory, seed 0": ("memory", "memory"),
-    "memory, seed 1": ("memory-1", "memory"), "DRQN, seed 0": ("drqn", "drqn"),
-    "DRQN, seed 1": ("drqn-1", "drqn"), "place, seed 0": ("place", "place"),
-    "place, seed 1": ("place-1", "place"), "place and beacon, seed 0": ("place-beacon", "place"),
-    "place and beacon, seed 1": ("place-beacon-1", "place"), "the planner": ("imitation", "laser"),
+LESSONS = {  # label -> file of seed 0, pilot, number of seeds
+    "DQN": ("dqn", "dqn", 3), "imitation": ("imitation", "imitation", 2),
+    "32 demonstrations alone": ("demonstrations-32", "demonstrations", 2),
+    "imitation from disparity": ("imitation-disparity", "imitation", 2),
+    "PQN": ("pqn", "pqn", 3), "memory": ("memory", "memory", 2), "DRQN": ("drqn", "drqn", 2),
+    "place": ("place", "place", 2), "DQN and beacon": ("dqn-beacon", "dqn", 2),
+    "imitation and beacon": ("imitation-beacon", "imitation", 1),
+    "place and beacon": ("place-beacon", "place", 2), "the planner": ("imitation", "laser", 1),
 }  # fmt: skip
 
 
@@ -74,10 +68,12 @@ def minutes(name: str) -> str:
 def lessons() -> str:
     """The table of extras/lessons/README.md: one row a pilot, one column a metric."""
     lines = ["| | " + " | ".join([*LABELS.values(), "minutes"]) + " |", "|---" * 7 + "|"]
-    for label, (name, pilot) in LESSONS.items():
-        cells = [metric(read(name)["pilots"][pilot], key) for key in LABELS]
-        trained = minutes(name) if pilot != "laser" else ""
-        lines.append(f"| {label} | " + " | ".join([*cells, trained]) + " |")
+    for label, (file, pilot, seeds) in LESSONS.items():
+        for seed in range(seeds):
+            name, trained = f"{file}-{seed}".removesuffix("-0"), pilot != "laser"
+            cells = [metric(read(name)["pilots"][pilot], key) for key in LABELS]
+            cells += [minutes(name) if trained else ""]
+            lines.append(f"| {label}{f', seed {seed}' * trained} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
