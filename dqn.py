@@ -194,7 +194,7 @@ class Replay:
 
     def __init__(self, capacity: int, num_envs: int) -> None:
         self.rows, self.num_envs = shape = (capacity // num_envs, num_envs)  # T, L
-        self.frames = np.full((*shape, 84, 84), 0, np.uint8)  # (T, L, 84, 84) fails now or never
+        self.frames = np.full((*shape, 84, 84), 0, np.uint8)  # (T, L, 84, 84) takes memory now
         self.actions, self.ends = np.zeros(shape, np.int64), np.zeros(shape, np.uint8)  # (T, L)
         self.rewards = np.zeros(shape, np.float32)  # (T, L)
         self.last_frames: dict[tuple[int, int], ndarray] = {}  # (row, env) -> (84, 84)
