@@ -26,7 +26,7 @@ A seed is a forest, and there are three sets of them:
     test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
 
 A run's folder holds config.json, log.csv, validation.jsonl (one line an episode), checkpoint.pt and
-best.pt: the weights that did best in validation; in the last tenth of steps, their mean instead.
+best.pt: the weights that did best in validation; in the last tenth, the mean of all since it began.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -334,7 +334,7 @@ def save(path: Path, content: bytes | dict[str, Any]) -> None:
     """Write bytes, or tensors and plain values. The file stands under its name only when whole."""
     part = path.with_name(f".{path.name}.part")
     if isinstance(content, dict):
-        torch.save(content, buffer := io.BytesIO())  # to a full disk it would say nothing
+        torch.save(content, buffer := io.BytesIO())  # torch.save says nothing of a full disk
         content = buffer.getvalue()
     try:
         part.write_bytes(content)

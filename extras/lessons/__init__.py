@@ -40,6 +40,6 @@ def run(config: type, argv: Sequence[str]) -> int:
     recipes = config.__mro__[: config.__mro__.index(deepflight.Config) + 1]
     old = next((base.train for base in recipes if base.train is not config.train), dqn.train)
     lines = [inspect.getsource(train).splitlines() for train in (old, config.train)]
-    lines[0] = [line.replace(" [!]", "").rstrip(" #") for line in lines[0]]  # its marks, not ours
+    lines[0] = [line.replace(" [!]", "").rstrip(" #") for line in lines[0]]  # without its own marks
     print(*unified_diff(*lines, f"{old.__module__}.train", "train", lineterm=""), sep="\n")
     return 0
