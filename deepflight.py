@@ -147,9 +147,7 @@ class Run:
     def go(self) -> int:
         """Train, validate, log and save, until the last step or a signal; returns the exit code."""
         envs, c = self.envs, self.c
-        self.folder.mkdir(parents=True, exist_ok=True)
         save(self.folder / "config.json", json.dumps(asdict(c), indent=2).encode())
-        again = f'"{sys.executable}" {c.program}'
         with stop_signals() as stopped:
             print(f"{c.steps:,} steps in {self.folder}; live: {sys.executable} -m extras.cockpit")
             print(f"\n{HEAD}", flush=True)
@@ -158,13 +156,14 @@ class Run:
                     raise FloatingPointError(f"step {envs.steps:,}: the loss is {self.agent.loss}")
                 if due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
                     self.validate()
-                if stopped and envs.steps < c.steps:
-                    self.save_checkpoint()
-                    print(f"saved at step {envs.steps:,}; to go on:", file=sys.stderr)
-                    print(f'{again} train --resume "{self.folder}"', file=sys.stderr)
-                    return 128 + stopped[0]
-        print(f'to fly it:\n{again} eval --weights "{self.folder}"')
-        return 0
+                if stopped:
+                    break
+            self.save_checkpoint()
+        finished = envs.steps >= c.steps
+        print("to fly it:" if finished else f"saved at step {envs.steps:,}; to go on:")
+        todo = "eval --weights" if finished else "train --resume"
+        print(f'"{sys.executable}" {c.program} {todo} "{self.folder}"')
+        return 0 if finished else 128 + stopped[0]
 
     def validate(self) -> None:
         """Fly the validation forests without exploring, add a row to the log, and keep the weights
@@ -395,10 +394,7 @@ def stop_signals() -> Iterator[list[int]]:
 
 def whole(text: str) -> int:
     """The whole number that a user typed, maybe as 1e6; ValueError if it is none."""
-    number = float(text)
-    if not number.is_integer():
-        raise ValueError
-    return int(text) if text.isdecimal() else int(number)
+    return int(text if text.isdecimal() else f"{float(text):.15g}")  # the latter makes 1000000
 
 
 def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespace:

@@ -58,6 +58,7 @@ def go(folder: Path, cuts: set[int] = frozenset(), **changed: int) -> Run:
                 signal.raise_signal(signal.SIGINT)
             yield learner
 
+    folder.mkdir(exist_ok=True)
     c = type("Cut", (Small,), {"train": staticmethod(train)})(**SMALL | changed)
     run, codes = Run(c, folder), []
     while codes.append(run.go()) or codes[-1]:
@@ -111,7 +112,7 @@ def test_ctrl_c_and_a_kill_save_and_print_the_command_that_goes_on(
         process = subprocess.Popen(command, **pipes)
         assert any("step  eps" in line for line in process.stdout), process.stderr.read()
         process.send_signal(number)
-        *_, saved, line = process.communicate()[1].splitlines()
+        *_, saved, line = process.communicate()[0].splitlines()
         assert (process.returncode, saved[:14]) == (128 + number, "saved at step ")
         command = shlex.split(line)
     assert command[:2] == [sys.executable, __file__] and main(command[2:], Small) == 0

@@ -36,6 +36,8 @@ def run(config: type, argv: Sequence[str]) -> int:
     """The command line of deepflight.py, and `diff`: how a lesson's loop differs from the one that
     it builds on, which is dqn.train or that of another lesson."""
     if list(argv) != ["diff"]:
+        if {"-h", "--help"} & set(argv[:1]):
+            print("diff: how this lesson's loop differs from the one that it builds on. Else:\n")
         return deepflight.main(argv, config)
     recipes = config.__mro__[: config.__mro__.index(deepflight.Config) + 1]
     old = next((base.train for base in recipes if base.train is not config.train), dqn.train)

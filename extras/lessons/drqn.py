@@ -96,7 +96,7 @@ class QNetwork(pqn.QNetwork):
     def recall(self, x: Tensor, last: Tensor, h: Tensor) -> Tensor:
         """The next hidden state (B, H) of what was looked at, x (B, 266), and of the one before, h
         (B, H), which counts as 0 at the start of an episode."""
-        return self.gru(x, torch.where(last[:, None] == NONE, 0.0, h))
+        return self.gru(x, torch.where(last[:, None] == NONE, 0.0, h))  # (B, H)
 
     def unroll(self, s: Tensor, last: Tensor, h: Tensor, bfloat16: bool = False) -> Tensor:
         """All hidden states (T, B, H) along s (T, B, 4, 84, 84) and last (T, B), from h (B, H)."""
@@ -125,6 +125,14 @@ class QNetwork(pqn.QNetwork):
             for drone, state in zip(todo, self.recall(self.look(s, last), last, h), strict=True):
                 drone.hidden, drone.key = state, (drone.seed, len(drone.actions))
         return torch.stack([drone.hidden for drone in drones])
+
+
+class Forgetful(QNetwork):
+    """The control: the same network, whose hidden state is 0 before every step."""
+
+    def recall(self, x: Tensor, last: Tensor, h: Tensor) -> Tensor:
+        """The next hidden state (B, H) of x (B, 266) alone."""
+        return super().recall(x, last, torch.zeros_like(h))  # (B, H)
 
 
 def last_actions(drones: Sequence[Drone], before: int = 0) -> Tensor:
@@ -216,5 +224,16 @@ DRQNConfig = recipe(
     network=QNetwork, steps=250_000, num_envs=64, rollout=32, batch_size=8, mirror=False,
 )  # fmt: skip
 
+ForgetConfig = recipe(
+    "ForgetConfig", DRQNConfig, program="-m extras.lessons.drqn forget", network=Forgetful
+)
+
+
+def main() -> int:
+    """A network that remembers, or after the word `forget` one that does not."""
+    forget = sys.argv[1:2] == ["forget"]
+    return run(ForgetConfig if forget else DRQNConfig, sys.argv[1 + forget :])
+
+
 if __name__ == "__main__":
-    sys.exit(run(DRQNConfig, sys.argv[1:]))
+    sys.exit(main())

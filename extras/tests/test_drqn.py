@@ -9,7 +9,9 @@ from torch import Tensor
 
 import dqn
 from env import VecForest, World
-from extras.lessons.drqn import HIDDEN, NONE, Agent, DRQNConfig, QNetwork, Rollout, learn
+from extras.lessons.drqn import (
+    HIDDEN, NONE, Agent, DRQNConfig, Forgetful, QNetwork, Rollout, learn,
+)  # fmt: skip
 from extras.tests.test_expert import assert_same_training, finish, little_to_fly
 
 __all__ = ["little_to_fly"]  # a fixture of all tests here too
@@ -36,6 +38,16 @@ def test_side_by_side_drones_remember_what_each_remembers_alone() -> None:
         for key, h in flown(q, [seed], 1, 12).items():
             assert torch.allclose(h, together[key], atol=1e-5), key
     assert len(together) > 30
+
+
+def test_the_control_forgets_its_hidden_state() -> None:
+    torch.manual_seed(0)
+    q, control = QNetwork(9), Forgetful(9)
+    control.load_state_dict(q.state_dict())
+    x, last, h = torch.randn(5, 266), torch.randint(9, (5,)), torch.randn(5, HIDDEN)
+    empty = q.recall(x, last, torch.zeros(5, HIDDEN))
+    assert torch.equal(control.recall(x, last, h), empty)
+    assert not torch.allclose(q.recall(x, last, h), empty)
 
 
 def test_asking_twice_in_a_step_changes_nothing() -> None:
