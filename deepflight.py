@@ -12,21 +12,21 @@ shaped reward, validation, files, then `eval` with its statistics, and the comma
 `train` prints a row after each validation:
 
          step  eps   /s   min  return | return length  cross  crash
-       15,000 0.64  126    24   -16.8 |   -6.7    119    21%     6%
+       15,000 0.64  108    29   -16.8 |   -6.7    119    21%     6%
 
-After 15,000 control steps 64 % of the actions are random. The training makes 126 steps a second, 24
+After 15,000 control steps 64 % of the actions are random. The training makes 108 steps a second, 29
 minutes are left, and the last 100 episodes had a mean return of -16.8 (in tables and logs the plain
 sum of rewards, without gamma). Without random actions the network flew through 48 validation
-forests: return -6.7, episodes of 119 steps (random ones have 27), 21 % crossed, and 6 % crashed
-(shares of 48 are uncertain by up to 14 points).
+forests: return -6.7, episodes of 119 steps (random ones have about 27), 21 % crossed, and 6 %
+crashed (shares of 48 are uncertain by up to 14 points).
 
 A seed is a forest, and there are three sets of them:
     training    [0, 10^9)
     validation  [10^9, 2 * 10^9)    48 of them may choose the weights (best.pt)
-    test        from 4 * 10^9 on    flown by `eval`: neither shaped the weights nor chose them
+    test        from 4 * 10^9 on    flown by `eval`: training and validation never see them
 
 A run's folder holds config.json, log.csv, validation.jsonl (one line an episode), checkpoint.pt and
-best.pt: the weights that did best in validation; in the last tenth, the mean of all since it began.
+best.pt: the weights that did best in validation; from the last tenth on, the mean over it.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -108,7 +108,7 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
     more than arrival. So look at the share that arrived too, and not only at that which crossed.
 
     On purpose, these parts change which way of flying is best. Parts of the form gamma * f(s2) -
-    f(s), with f = 0 at an episode's end, would not: discounted, all but -f(start) cancels,
+    f(s), with f = 0 at an episode's end, would not: in the discounted sum they cancel to -f(start),
     whatever the drone does [Ng 1999]. Printed returns leave the three out.
     """
     forward = np.array([drone.forward for drone in drones])  # (L,) m
@@ -135,7 +135,7 @@ class Run:
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log, self.validations = c, folder, [], []
         self.rng = np.random.default_rng(c.seed)
-        self.forest_rng = np.random.default_rng([c.seed, 1])  # not rng: it explores
+        self.forest_rng = np.random.default_rng([c.seed, 1])  # rng explores
         seeds = iter(lambda: int(self.forest_rng.integers(TRAIN_END)), None)  # endless
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)  # dqn.train, or a lesson's
@@ -240,8 +240,8 @@ def evaluate(args: argparse.Namespace, config: type[Config]) -> int:
         path.open("ab").close()
     torch.set_num_threads(args.threads)
     print(f"{len(seeds)} forests from seed {seeds[0]}; 95 % intervals in [ ]\n", flush=True)
-    flown, random = {}, {"random": random_pilot(np.random.default_rng(0))}
-    for who, pilot in (random | config.baselines | {name: dqn_pilot(q)}).items():
+    flown, pilots = {}, {"random": random_pilot(np.random.default_rng(0))} | config.baselines
+    for who, pilot in (pilots | {name: dqn_pilot(q)}).items():
         print(f"flying {who}", file=sys.stderr)
         flown[who] = fly(pilot, seeds, world)
     metrics = {who: summarize(flown[who], flown["random"]) for who in flown}
@@ -383,7 +383,7 @@ def stop_signals() -> Iterator[list[int]]:
     """A list that Ctrl-C and the other signals are written to, so that the running step can end.
     One that nohup ignores stays ignored."""
     stopped: list[int] = []
-    names = "SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1"  # clusters send SIGUSR1 before the end
+    names = "SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1"  # clusters send SIGUSR1; Windows lacks some
     with ExitStack() as afterwards:
         for number in {getattr(signal, name, signal.SIGINT) for name in names}:
             if signal.getsignal(number) != signal.SIG_IGN:

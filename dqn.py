@@ -8,8 +8,8 @@ late. Three rewards 1, 1, -10 and then the end: 1 + 0.99 * 1 + 0.99^2 * -10 = -7
 **Q(s, a)** is the return to expect after action a in s, if the best action is taken in every later
 step. An agent that knows Q can act: it takes the action with the highest Q. Here a neural network
 learns Q. It is a function with 1.7 million adjustable numbers, its weights: four frames go in, nine
-numbers come out. For each Q(s, a) it needs a target y. Nobody has the true one. But the return from
-s is r plus gamma times that from s2, so every transition (s, a, r, s2) makes its own target:
+numbers come out. For each Q(s, a) it needs a target y. Nobody knows the true one. But the return
+from s is r plus gamma times the return from s2, so every transition (s, a, r, s2) makes its own:
 
     y = r + gamma * max over a2 of Q(s2, a2)        or y = r, if the world ended the episode
 
@@ -29,7 +29,7 @@ The truth moves backwards. Three things can go wrong, and DQN has an answer to e
   * Steps that follow each other are alike (correlated samples), and a network that learns from them
     in that order forgets the rest. So a **replay** buffer keeps transitions, and each update draws
     some at random. Flights of older, worse agents still serve, because y takes the best a2, not
-    the one that was flown (Q-learning is off-policy; but see `window`).
+    the one that was flown (Q-learning is off-policy).
   * Each update of Q would also move its own targets, in a chase without end. So they come from a
     **target network** Q^, a copy of Q that is synced only now and then.
   * An agent that always does what seems best never finds what is better. So it **explores**: with
@@ -53,7 +53,7 @@ DQN for one environment, without what is marked [+] below:
 
 Legend: A actions, B transitions in a batch, L environments side by side (E = L in training), T
 rows of the replay. A pass is one control step of all environments. [+name] marks what [Mnih15] does
-not have; the setting of that name switches it off. Three more are always on: Adam,
+not have; the setting of that name switches it off. Three more differences are always on: Adam,
 bfloat16 where the processor knows it, and rewards that are not clipped to -1 .. 1.
 """
 
@@ -193,7 +193,8 @@ class Replay:
     """
 
     def __init__(self, capacity: int, num_envs: int) -> None:
-        self.rows, self.num_envs = shape = (capacity // num_envs, num_envs)  # T, L
+        self.rows, self.num_envs = capacity // num_envs, num_envs  # T, L
+        shape = (self.rows, num_envs)
         self.frames = np.full((*shape, 84, 84), 0, np.uint8)  # (T, L, 84, 84) takes memory now
         self.actions, self.ends = np.zeros(shape, np.int64), np.zeros(shape, np.uint8)  # (T, L)
         self.rewards = np.zeros(shape, np.float32)  # (T, L)
@@ -238,7 +239,7 @@ class Replay:
         rows, envs = (row[:, None] + np.arange(n)) % self.rows, env[:, None]  # (B, n), (B, 1)
         ended = self.ends[rows, envs] != LIVE  # (B, n)
         # reached: no earlier step has ended the episode. In the example of the class, row 1 with
-        # n = 3: ended 0 1 0, ends so far 0 1 1, reached 1 1 0, count 2, and the last row is 2.
+        # n = 3: ended 0 1 0, ends so far 0 1 1, ends before 0 0 1, reached 1 1 0, count 2, last 2.
         reached = np.cumsum(ended, 1) - ended == 0  # (B, n)
         discounts = np.float32(gamma) ** np.arange(n, dtype=np.float32)  # (n,)
         r = (reached * discounts * self.rewards[rows, envs]).sum(1)  # (B,)
@@ -247,7 +248,7 @@ class Replay:
         end = self.ends[last, env]  # (B,)
         # LIVE: s2 stands one row later. TERMINAL: it is never used. TRUNCATED: mended below.
         s2 = self.stack(np.where(end == LIVE, (last + 1) % self.rows, last), env)  # (B, 4, 84, 84)
-        for i in np.flatnonzero(end == TRUNCATED):  # it lacks the newest frame
+        for i in np.flatnonzero(end == TRUNCATED):  # s2 lacks the newest frame
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], env[i]]]
         s, a = self.stack(row, env), self.actions[row, env]  # (B, 4, 84, 84), (B,)
         gamma_n = np.float32(gamma) ** count.astype(np.float32)  # (B,)
@@ -291,7 +292,7 @@ class Agent(nn.Module):
             self.q = QNetwork(actions).to(memory_format=torch.channels_last)  # line 2
         self.q_target = copy.deepcopy(self.q)  # line 3
         self.averaged = torch.optim.swa_utils.AveragedModel(self.q)  # [+swa_fraction]
-        eps = 1.5e-4 * c.huber_delta
+        eps = 1.5e-4 * c.huber_delta  # see `learn`
         self.optimizer = torch.optim.Adam(self.q.parameters(), c.lr, eps=eps, fused=True)
         self.epsilon, self.loss = 1.0, 0.0
 
@@ -327,9 +328,9 @@ def learn(agent: Agent, b: Batch, c: DQNConfig) -> None:
 
     Adam, the optimizer, moves each weight by -lr * m / (sqrt(v) + eps). m = 0.9 * m + 0.1 * g is a
     running mean of its gradient g, and v = 0.999 * v + 0.001 * g**2 one of g**2 (both corrected for
-    their start at 0). m / sqrt(v) is about 1 at most, so all weights move about equally fast, but
-    slower where gradients are below eps. Ours is Rainbow's eps, 1.5e-4 [Hessel 2018], times
-    huber_delta, because our gradients may be larger by this factor.
+    their start at 0). m / sqrt(v) is rarely above 1, so all weights move about equally fast, but
+    slower where gradients are below eps. Ours is Rainbow's 1.5e-4 [Hessel 2018] times huber_delta,
+    because our gradients may be larger by this factor.
     """
     with torch.no_grad():
         q2 = agent.q_target(b.s2, c.bfloat16)  # (B, A)

@@ -225,7 +225,8 @@ class VecForest:
         self.steps += len(drones)
         self.episodes += [drone.episode() for drone in drones if drone.outcome]
         outcomes = np.array([drone.outcome for drone in drones])  # (E,)
-        return s2, r, ~np.isin(outcomes, ("", "time")), outcomes == "time", drones
+        terminated = ~np.isin(outcomes, ("", "time"))  # (E,)
+        return s2, r, terminated, outcomes == "time", drones
 
 
 Pilot = Callable[[ndarray, VecForest], Sequence[int]]  # a policy: (E, 4, 84, 84) -> actions (E,)

@@ -34,8 +34,9 @@ straight ahead along = 10, across = 0.3, half_chord = 0.4, distance = 9.6 and co
 A pinhole camera has two rules:
   * Column i looks to the left by a bearing with tan(bearing) = (41.5 - i) / 42. So the columns are
     equally spaced on the flat image, and not in angle.
-  * Row i, at depth z, looks at a point (41.5 - i) / 42 * z metres above the camera. Depth is
-    distance * cos(bearing), straight ahead. Without the cosine a wall's straight top would bend.
+  * Depth is how far a point is straight ahead: distance * cos(bearing). At depth z, row i shows a
+    point (41.5 - i) / 42 * z metres above the camera. With distance in place of depth, a wall's
+    straight top would bend.
 The trunk of the example is 9.6 m away. Its top is 4 m higher than the camera, its foot 2 m lower,
 so it fills the rows from 41.5 - 42 * 4 / 9.6 = 24.0 to 41.5 + 42 * 2 / 9.6 = 50.25.
 
@@ -106,7 +107,7 @@ def raycast(centres: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray
     half_chord = np.sqrt(np.where(hit, radius**2 - across**2, 0.0))  # (N, M) m
     distance = np.where(hit, along - half_chord, np.inf)  # (N, M) m
     nearest = distance.min(0, initial=np.inf)  # (M,) m
-    half_chord[distance > nearest] = 0.0  # so max takes the nearest trunk's
+    half_chord[distance > nearest] = 0.0  # all but the nearest trunk's, for max below
     return nearest, half_chord.max(0, initial=0.0) / radius
 
 
@@ -115,8 +116,8 @@ def shade(grey: ndarray | float, air: ndarray | float, depth: ndarray, scene: Sc
 
     air: m of air before it, or 0 for the beacon, which always looks clear. The grey camera mixes
     the grey level with the sky's: the more air, the more sky, and only sky where the view ends. A
-    stereo camera has two lenses, a baseline apart, which see a point in columns that differ by
-    focal length * baseline / depth: the disparity. Ours is 255 * near / depth, at most 255.
+    stereo camera sees a point through two lenses, in two columns. They differ by the disparity,
+    which is in proportion to 1 / depth. Ours is 255 * near / depth, at most 255.
 
     >>> shade(0, 0, np.array([1.0, 2.0, 4.0, np.inf]), Scene(camera="disparity"))
     array([255. , 255. , 127.5,   0. ])

@@ -75,8 +75,8 @@ def all_ways(title: str, episodes: list[dict], world: World) -> Image.Image:
             text = f"{count} {ENDS[end]}"
             inside = "white" if end in HOLLOW else COLOURS[end]
             draw.circle((x + 5, 29), 5, inside, COLOURS[end], 2)
-            draw.text((x + 13, 21), text, fill="black", font_size=13)
-            x += draw.textlength(text, font_size=13) + 26
+            draw.text((x + 13, 21), text, fill="black", font_size=12)
+            x += draw.textlength(text, font_size=12) + 21
     return panel
 
 

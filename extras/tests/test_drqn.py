@@ -9,9 +9,8 @@ from torch import Tensor
 
 import dqn
 from env import VecForest, World
-from extras.lessons.drqn import (
-    HIDDEN, NONE, Agent, DRQNConfig, Forgetful, QNetwork, Rollout, learn,
-)  # fmt: skip
+from extras.lessons import drqn
+from extras.lessons.drqn import HIDDEN, NONE, Agent, DRQNConfig, QNetwork, Rollout, learn
 from extras.tests.test_expert import assert_same_training, finish, little_to_fly
 
 __all__ = ["little_to_fly"]  # a fixture of all tests here too
@@ -42,7 +41,7 @@ def test_side_by_side_drones_remember_what_each_remembers_alone() -> None:
 
 def test_the_control_forgets_its_hidden_state() -> None:
     torch.manual_seed(0)
-    q, control = QNetwork(9), Forgetful(9)
+    q, control = QNetwork(9), drqn.Forgetful(9)
     control.load_state_dict(q.state_dict())
     x, last, h = torch.randn(5, 266), torch.randint(9, (5,)), torch.randn(5, HIDDEN)
     empty = q.recall(x, last, torch.zeros(5, HIDDEN))
