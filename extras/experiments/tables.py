@@ -32,8 +32,9 @@ LESSONS = {  # label -> file of seed 0, pilot, number of seeds
     "32 demonstrations alone": ("demonstrations-32", "demonstrations", 2),
     "imitation from disparity": ("imitation-disparity", "imitation", 2),
     "PQN": ("pqn", "pqn", 3), "memory": ("memory", "memory", 2), "DRQN": ("drqn", "drqn", 2),
+    "DRQN that forgets": ("drqn-forget", "drqn", 2),
     "place": ("place", "place", 2), "DQN and beacon": ("dqn-beacon", "dqn", 2),
-    "imitation and beacon": ("imitation-beacon", "imitation", 1),
+    "imitation and beacon": ("imitation-beacon", "imitation", 2),
     "place and beacon": ("place-beacon", "place", 2), "the planner": ("imitation", "laser", 1),
 }  # fmt: skip
 

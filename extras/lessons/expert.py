@@ -51,9 +51,8 @@ whatever the observation is worth. Only with --bellman does the level of the out
     imitation, seed 1       87.2 %       0.3 %       84.1
     the planner             98.9 %       0.0 %       88.7      (arrival alone pays)
 
-With the beacon 90.3 % arrive, at a return of 88.3 (dqn: 90.6 % at 56.9). TD targets beside the
-scores made it worse: after 60,000 steps 53.5 and 54.5 % of 200 crossed, without them 72.5 and
-73.5 % (results/demonstrations.json, from trainings of an earlier version).
+With the beacon 90.3 and 90.6 % arrive, at returns of 88.3 and 87.3 (dqn: 90.6 and 90.8 % at 56.9
+and 53.4).
 
 Legend, beside that of dqn.py: W candidate trajectories, T steps of each, P points that a laser sees
 [Ross 2011]  A reduction of imitation learning to no-regret online learning, AISTATS
