@@ -121,7 +121,7 @@ def shaped_reward(r: ndarray, drones: Sequence[Drone], c: Config) -> ndarray:
 # -------------------------------------------------- train: what stands around the loop of dqn.py
 
 HEAD = "     step  eps   /s   min  return | return length  cross  crash"
-ROW = "{step:9,} {epsilon:4.2f} {speed:4.0f} {minutes:5.0f} {train_return:7.1f} |"
+ROW = "{step:9,} {epsilon:4.2f} {speed:4.0f} {left:z5.0f} {train_return:7.1f} |"
 ROW += "{validation_return:7.1f} {validation_steps:6.0f} {validation_crossed:6.0%}"
 ROW += " {validation_crash:6.0%}"
 
@@ -186,33 +186,31 @@ class Run:
         scores = [(row[share], row["validation_progress"]) for row in self.log]
         if averaged or scores[-1] > max(scores[:-1], default=(-1, 0)):
             save_weights(self.folder / "best.pt", q, self.c)
-        lines = [self.log[0].keys(), *(row.values() for row in self.log)]
-        text = "".join(",".join(map(str, line)) + "\n" for line in lines)
-        save(self.folder / "log.csv", text.encode())
+        rows = [self.log[0].keys(), *(row.values() for row in self.log)]
+        save(self.folder / "log.csv", "".join(",".join(map(str, x)) + "\n" for x in rows).encode())
         save(self.folder / "validation.jsonl", "".join(self.validations).encode())
         self.save_checkpoint()
-        minutes = max(self.c.steps - envs.steps, 0) / speed / 60  # that are left
-        print(ROW.format(**row, speed=speed, minutes=minutes), flush=True)
+        left = (self.c.steps - envs.steps) / speed / 60  # minutes
+        print(ROW.format(**row, speed=speed, left=left), flush=True)
 
     # Skip on a first reading: how a training goes on after an interruption.
     def save_checkpoint(self) -> None:
         """Write the checkpoint, 34 MB. In place of the replay it holds all actions, a byte each."""
-        content = {"config": asdict(self.c), "fingerprint": fingerprint(self.c), "log": self.log,
-                   "validations": self.validations, "actions": self.envs.history,
-                   "seconds": time.perf_counter() - self.began,
-                   "forests": self.forest_rng.bit_generator.state,
-                   "rng": self.rng.bit_generator.state, "agent": self.agent.state_dict(),
-                   "optimizer": self.agent.optimizer.state_dict()}  # fmt: skip
-        save(self.folder / "checkpoint.pt", content)
+        save(self.folder / "checkpoint.pt", {
+            "config": asdict(self.c), "fingerprint": fingerprint(self.c), "log": self.log,
+            "validations": self.validations, "actions": self.envs.history,
+            "seconds": time.perf_counter() - self.began, "rng": self.rng.bit_generator.state,
+            "forests": self.forest_rng.bit_generator.state, "agent": self.agent.state_dict(),
+            "optimizer": self.agent.optimizer.state_dict()})  # fmt: skip
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Set everything as it was. To fly all actions again puts the same into the replay."""
         print(f"flying {len(saved['actions']) * self.c.num_envs:,} steps again", flush=True)
         for actions in saved["actions"]:
             s = self.envs.reset_done()  # (L, 4, 84, 84)
-            s2, r, terminated, truncated, drones = self.envs.step(actions)
+            s2, r, *ended, drones = self.envs.step(actions)  # ended: terminated, truncated
             r = shaped_reward(r, drones, self.c)  # (L,)
-            self.replay.add(s, np.array(list(actions)), r, s2, terminated, truncated)
+            self.replay.add(s, np.array([*actions]), r, s2, *ended)
         if self.forest_rng.bit_generator.state != saved["forests"]:  # another number of episodes
             raise InputError(f"{self.folder}: its actions lead to other episodes on this machine")
         self.agent.load_state_dict(saved["agent"])
@@ -394,7 +392,7 @@ def stop_signals() -> Iterator[list[int]]:
 
 def whole(text: str) -> int:
     """The whole number that a user typed, maybe as 1e6; ValueError if it is none."""
-    return int(text if text.isdecimal() else f"{float(text):.15g}")  # the latter makes 1000000
+    return int(text if text.isdecimal() else f"{float(text):.19g}")  # the latter makes 1000000
 
 
 def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespace:
@@ -431,10 +429,8 @@ def make_run(args: argparse.Namespace, config: type[Config]) -> Run:
     if not args.resume:
         free = (f"{i:03d}" for i in range(1, 10**9) if not Path(f"runs/{i:03d}").exists())
         folder = Path("runs", args.name or next(free))
-        if folder.exists():
-            raise InputError(f"{folder} exists: give another --name, --resume it, or delete it")
         c = config(**(config.beacon_recipe if given.get("beacon") else {}) | given)
-        folder.mkdir(parents=True)  # now, so that a training started meanwhile takes another
+        folder.mkdir(parents=True)  # fails if it exists, so no two trainings share one
         return Run(c, folder)
     if args.name or given.keys() - {"steps"}:
         raise InputError(f"{args.resume} keeps its settings: only --steps may be given")

@@ -53,8 +53,8 @@ DQN for one environment, without what is marked [+] below:
 
 Legend: A actions, B transitions in a batch, L environments side by side (E = L in training), T
 rows of the replay. A pass is one control step of all environments. [+name] marks what [Mnih15] does
-not have; the setting of that name switches it off. Three more differences are always on: Adam,
-bfloat16 where the processor knows it, and rewards that are not clipped to -1 .. 1.
+not have; the setting of that name switches it off. More differences are always on: Adam, bfloat16
+where the processor knows it, rewards that are not clipped to -1 .. 1, and an action in each frame.
 """
 
 import copy
@@ -138,8 +138,7 @@ class QNetwork(nn.Module):
         self.conv = nn.Sequential(
             nn.Conv2d(4, 32, 8, 4), nn.ReLU(),  # (B, 32, 20, 20): 4 frames, 32 filters of 8x8, by 4
             nn.Conv2d(32, 64, 4, 2), nn.ReLU(),  # (B, 64, 9, 9)
-            nn.Conv2d(64, 64, 3, 1), nn.ReLU(),  # (B, 64, 7, 7)
-            nn.Flatten(),  # (B, 3136)
+            nn.Conv2d(64, 64, 3, 1), nn.ReLU(), nn.Flatten(),  # (B, 64, 7, 7), then (B, 3136)
         )  # fmt: skip
         self.head = nn.Sequential(nn.Linear(3136, 512), nn.ReLU(), nn.Linear(512, actions))
 
@@ -156,7 +155,7 @@ class QNetwork(nn.Module):
 
     @torch.no_grad()
     def values(self, s: ndarray, drones: Any) -> ndarray:
-        """Q(s, .) (E, A) of s (E, 4, 84, 84) uint8, for acting. drones: for lessons only."""
+        """Q(s, .) (E, A) of s (E, 4, 84, 84) uint8, for acting. drones: whose s; unused here."""
         return self(torch.from_numpy(s)).numpy()
 
 
@@ -219,8 +218,8 @@ class Replay:
     def sample(self, size: int, n: int, gamma: float, rng: np.random.Generator) -> Batch:
         """Draw transitions uniformly.
 
-        The oldest three rows are left out, because the frames before them are overwritten. The
-        newest n rows are left out, because their s2 is not there yet. In the ring above, row 7 is
+        The oldest three rows are left out, because the frames before them may be missing. The
+        newest n rows are left out, because their s2 may be missing. In the ring above, row 7 is
         written next. With n = 2, rows 7, 8 and 9 and rows 5 and 6 are left out.
         """
         oldest = max(self.added - self.rows, 0) + 3
@@ -241,8 +240,8 @@ class Replay:
         # reached: no earlier step has ended the episode. In the example of the class, row 1 with
         # n = 3: ended 0 1 0, ends so far 0 1 1, ends before 0 0 1, reached 1 1 0, count 2, last 2.
         reached = np.cumsum(ended, 1) - ended == 0  # (B, n)
-        discounts = np.float32(gamma) ** np.arange(n, dtype=np.float32)  # (n,)
-        r = (reached * discounts * self.rewards[rows, envs]).sum(1)  # (B,)
+        discounts = np.float32(gamma) ** np.arange(n + 1, dtype=np.float32)  # (n + 1,)
+        r = (reached * discounts[:n] * self.rewards[rows, envs]).sum(1)  # (B,)
         count = reached.sum(1)  # (B,) rewards in r
         last = (row + count - 1) % self.rows  # (B,) the row of the last one
         end = self.ends[last, env]  # (B,)
@@ -251,8 +250,7 @@ class Replay:
         for i in np.flatnonzero(end == TRUNCATED):  # s2 lacks the newest frame
             s2[i] = [*s2[i, 1:], self.last_frames[last[i], env[i]]]
         s, a = self.stack(row, env), self.actions[row, env]  # (B, 4, 84, 84), (B,)
-        gamma_n = np.float32(gamma) ** count.astype(np.float32)  # (B,)
-        return Batch(*map(torch.from_numpy, (s, a, r, s2, gamma_n, end)))
+        return Batch(*map(torch.from_numpy, (s, a, r, s2, discounts[count], end)))
 
     def stack(self, row: ndarray, env: ndarray) -> ndarray:
         """The observations (B, 4, 84, 84) at row (B,), env (B,). Where an episode began less than

@@ -61,7 +61,7 @@ from numpy import ndarray
 
 from render import Scene, draw_frame
 
-STACK = 4  # frames in an observation [DF §II-A]
+STACK = 4  # frames in an observation [DF §II-A]; dqn.py takes 4 for granted
 OUTCOMES = ("crash", "goal", "far", "back", "side", "time")  # how an episode may end
 
 
@@ -103,8 +103,7 @@ def reward(outcome: str, d_obs: float, d_goal: float, world: World) -> float:
     if outcome in ("crash", "far", "back", "side"):
         return world.r_crash
     r_near = world.r_precrash * (max(world.d_neg - d_obs, 0) / (world.d_neg - world.d_crash))
-    r_safe = world.r_safe if d_obs > world.d_neg else 0.0
-    return r_safe + r_near + (1 - d_goal / world.length)
+    return world.r_safe * (d_obs > world.d_neg) + r_near + (1 - d_goal / world.length)
 
 
 def plant(seed: int, world: World) -> ndarray:
@@ -153,7 +152,11 @@ class Drone:
         self.body.angular_velocity = yaw_rate
         self.space.step(world.dt)  # pymunk moves the drone for dt seconds
         self.sense()
-        self.outcome = self.judge()
+        (x, y, _), steps = self.pose, len(self.actions)
+        ended = {"crash": self.d_obs < world.d_crash, "goal": self.d_goal < world.goal_radius,
+                 "far": x > world.length, "back": x < -world.back, "side": abs(y) > world.width / 2,
+                 "time": steps >= world.max_steps}  # fmt: skip
+        self.outcome = next((name for name, holds in ended.items() if holds), "")  # the first
         r = reward(self.outcome, self.d_obs, self.d_goal, world)
         self.episode_return += r
         return r
@@ -170,14 +173,6 @@ class Drone:
         frame = draw_frame(self.pose, self.trunks, self.world)  # (84, 84)
         older = self.observation[1:] if self.actions else [frame] * (STACK - 1)
         self.observation = np.stack([*older, frame])  # (4, 84, 84)
-
-    def judge(self) -> str:
-        """How the episode has ended: the first below that holds, or "" in the air."""
-        (x, y, _), world = self.pose, self.world
-        ended = {"crash": self.d_obs < world.d_crash, "goal": self.d_goal < world.goal_radius,
-                 "far": x > world.length, "back": x < -world.back, "side": abs(y) > world.width / 2,
-                 "time": len(self.actions) >= world.max_steps}  # fmt: skip
-        return next((outcome for outcome, holds in ended.items() if holds), "")
 
     def episode(self) -> dict:
         """The episode so far: seed, actions as one digit each, and what came of them."""
@@ -196,9 +191,8 @@ class VecForest:
     def __init__(self, world: World, num_envs: int, seeds: Iterable) -> None:
         self.world, self.num_actions = world, world.num_actions
         self.drones, self.seeds = [Drone(world) for _ in range(num_envs)], iter(seeds)
-        self.episodes: list[dict] = []  # all that have ended
+        self.episodes, self.steps = [], 0  # all that have ended; control steps of all drones
         self.history: list[bytes] = []  # all actions; deepflight.Run resumes by flying them
-        self.steps = 0  # control steps of all drones together
 
     @property
     def active(self) -> list[Drone]:

@@ -75,7 +75,7 @@ class Scene:
     trunk_radius: float = 0.5  # m, authors' simulator
     trunk_height: float = 6.0  # m, authors' simulator
     altitude: float = 2.0  # m, of the camera, authors' simulator
-    view: float = 40.0  # m, how far the camera sees; ours, as all below but the length
+    view: float = 40.0  # m, how far the camera sees; ours, as all below except length
     length: float = 90.0  # m, x of the goal, which stands at y = 0 on the far edge [DF §II-A]
     beacon: bool = False  # a pole that makes the goal visible; off in the paper's world
     beacon_height: float = 20.0  # m
@@ -100,9 +100,8 @@ def raycast(centres: ndarray, radius: float, bearings: ndarray) -> tuple[ndarray
     >>> raycast(np.array([[5.0, 0.0]]), 0.5, np.array([0.0, 1.0]))
     (array([4.5, inf]), array([1., 0.]))
     """
-    cos, sin = np.cos(bearings), np.sin(bearings)  # (M,), (M,)
-    along = centres @ np.array([cos, sin])  # (N, M) m: x * cos + y * sin
-    across = centres @ np.array([-sin, cos])  # (N, M) m: y * cos - x * sin
+    along = centres @ np.array([np.cos(bearings), np.sin(bearings)])  # (N, M) m
+    across = centres @ np.array([-np.sin(bearings), np.cos(bearings)])  # (N, M) m
     hit = (along > 0) & (np.abs(across) < radius)  # (N, M) neither behind nor beside
     half_chord = np.sqrt(np.where(hit, radius**2 - across**2, 0.0))  # (N, M) m
     distance = np.where(hit, along - half_chord, np.inf)  # (N, M) m
@@ -196,9 +195,8 @@ def draw_panel(drone: Any, path: ndarray, q: ndarray, text: str) -> Image.Image:
     draw.line(path.ravel().tolist(), fill=colour, width=6)
     draw.circle(tuple(path[-1]), 8, fill=colour)
     for a, value in enumerate(q):
-        x, height = 8 + 50 * (len(q) - 1 - a), 120 * (value - q.min()) / max(np.ptp(q), 1e-9)
-        colour = "royalblue" if value == q.max() else "gray"
-        draw.rectangle([x, 608 - height, x + 42, 612], fill=colour)
+        x, top = 8 + 50 * (len(q) - 1 - a), 608 - 120 * (value - q.min()) / max(np.ptp(q), 1e-9)
+        draw.rectangle([x, top, x + 42, 612], fill="royalblue" if value == q.max() else "gray")
     draw.text((8, 618), "value of each turn, left to right", fill="black", font_size=28)
     draw.text((496, 476), text, fill="black", font_size=34, spacing=8)
     return image.reduce(2).quantize(64, Image.Quantize.FASTOCTREE)

@@ -3,7 +3,6 @@
     python -m extras.lessons.pqn train
     python -m extras.lessons.pqn eval --weights runs/001
     python -m extras.lessons.pqn plain train      the experiment: without normalized layers
-    python -m extras.lessons.pqn diff             its loop beside that of dqn.py
 
 DQN needs a replay because the steps of one drone are alike, and a target network because each
 update of Q moves its own targets. Here 128 drones fly at the same time, each in a forest of its
