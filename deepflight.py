@@ -26,7 +26,7 @@ A seed is a forest, and there are three sets of them:
     test        from 4 * 10^9 on    flown by `eval`: training and validation never see them
 
 A run's folder holds config.json, log.csv, validation.jsonl (one line an episode), checkpoint.pt and
-best.pt: the weights that did best in validation; from the last tenth on, the mean over it.
+best.pt: the weights that did best in validation; in the last tenth, the mean of those in it.
 
 Sources, for all four files
     [DF]                Deep Flight: autonomous quadrotor navigation with deep RL, CMU, 2017
@@ -135,7 +135,7 @@ class Run:
         torch.set_flush_denormal(True)  # numbers below 1e-38 count as 0, or they slow the optimizer
         self.c, self.folder, self.log, self.validations = c, folder, [], []
         self.rng = np.random.default_rng(c.seed)
-        self.forest_rng = np.random.default_rng([c.seed, 1])  # rng explores
+        self.forest_rng = np.random.default_rng([c.seed, 1])  # its own, because rng explores
         seeds = iter(lambda: int(self.forest_rng.integers(TRAIN_END)), None)  # endless
         self.envs = VecForest(World(beacon=c.beacon, camera=c.camera), c.num_envs, seeds)
         self.loop = c.train(c, self.envs, self.rng, shaped_reward)  # dqn.train, or a lesson's
@@ -157,8 +157,8 @@ class Run:
                 if due(c.validate_every, envs.steps, c.num_envs) or envs.steps >= c.steps:
                     self.validate()
                 if stopped:
+                    self.save_checkpoint()
                     break
-            self.save_checkpoint()
         finished = envs.steps >= c.steps
         print("to fly it:" if finished else f"saved at step {envs.steps:,}; to go on:")
         todo = "eval --weights" if finished else "train --resume"
@@ -392,7 +392,7 @@ def stop_signals() -> Iterator[list[int]]:
 
 def whole(text: str) -> int:
     """The whole number that a user typed, maybe as 1e6; ValueError if it is none."""
-    return int(text if text.isdecimal() else f"{float(text):.19g}")  # the latter makes 1000000
+    return int(text if text.isdecimal() else f"{float(text):.19g}")  # 1e6 is 1000000
 
 
 def parse(argv: Sequence[str] | None, config: type[Config]) -> argparse.Namespace:

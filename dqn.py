@@ -9,7 +9,7 @@ late. Three rewards 1, 1, -10 and then the end: 1 + 0.99 * 1 + 0.99^2 * -10 = -7
 step. An agent that knows Q can act: it takes the action with the highest Q. Here a neural network
 learns Q. It is a function with 1.7 million adjustable numbers, its weights: four frames go in, nine
 numbers come out. For each Q(s, a) it needs a target y. Nobody knows the true one. But the return
-from s is r plus gamma times the return from s2, so every transition (s, a, r, s2) makes its own:
+from s is r plus gamma times the return from s2, so every transition (s, a, r, s2) makes a target:
 
     y = r + gamma * max over a2 of Q(s2, a2)        or y = r, if the world ended the episode
 
@@ -54,7 +54,7 @@ DQN for one environment, without what is marked [+] below:
 Legend: A actions, B transitions in a batch, L environments side by side (E = L in training), T
 rows of the replay. A pass is one control step of all environments. [+name] marks what [Mnih15] does
 not have; the setting of that name switches it off. More differences are always on: Adam, bfloat16
-where the processor knows it, rewards that are not clipped to -1 .. 1, and an action in each frame.
+where the processor knows it, rewards that are not clipped to -1 .. 1, and no skipped frames.
 """
 
 import copy

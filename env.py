@@ -152,11 +152,12 @@ class Drone:
         self.body.angular_velocity = yaw_rate
         self.space.step(world.dt)  # pymunk moves the drone for dt seconds
         self.sense()
-        (x, y, _), steps = self.pose, len(self.actions)
+        x, y, _ = self.pose
         ended = {"crash": self.d_obs < world.d_crash, "goal": self.d_goal < world.goal_radius,
                  "far": x > world.length, "back": x < -world.back, "side": abs(y) > world.width / 2,
-                 "time": steps >= world.max_steps}  # fmt: skip
-        self.outcome = next((name for name, holds in ended.items() if holds), "")  # the first
+                 "time": len(self.actions) >= world.max_steps}  # fmt: skip
+        # The first of these that holds, or "" in the air.
+        self.outcome = next((name for name, holds in ended.items() if holds), "")
         r = reward(self.outcome, self.d_obs, self.d_goal, world)
         self.episode_return += r
         return r
@@ -191,8 +192,9 @@ class VecForest:
     def __init__(self, world: World, num_envs: int, seeds: Iterable) -> None:
         self.world, self.num_actions = world, world.num_actions
         self.drones, self.seeds = [Drone(world) for _ in range(num_envs)], iter(seeds)
-        self.episodes, self.steps = [], 0  # all that have ended; control steps of all drones
+        self.episodes: list[dict] = []  # all that have ended
         self.history: list[bytes] = []  # all actions; deepflight.Run resumes by flying them
+        self.steps = 0  # control steps of all drones together
 
     @property
     def active(self) -> list[Drone]:

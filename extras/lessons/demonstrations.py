@@ -50,9 +50,9 @@ because it need not fly at random first, epsilon is 0.05 from the start. Its nex
 
 In 80 steps no update is due, so the first line is what the 2,000 updates on demonstrations make.
 Its pilots fly 371 and 233 % longer than random, for which dqn needs 10,000 steps. With a margin of
-0 a demonstrated action need only be as good as the others. What that costs, if anything, is less
-than two seeds differ. After 60,000 steps the head start is worth 20 of return in both seeds, but
-fewer cross. With demonstrations in later batches fewer still cross, and more crash. Perhaps that is
+0 a demonstrated action need only be as good as the others, and the two seeds differ more than the
+two margins do. After 60,000 steps the head start is worth 20 of return in both seeds, but fewer
+cross. With demonstrations in later batches fewer still cross, and more crash. Perhaps that is
 because demonstrations hold no crash; but more exploring (last line) mends it in one seed only.
 
 [Hester 2018]  Deep Q-learning from demonstrations, AAAI; it also has a prioritized replay

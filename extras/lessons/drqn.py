@@ -35,8 +35,8 @@ computed by older weights (a stale state).
                enters it, `recall` makes one step, `unroll` a rollout; `hidden_states` keeps those
                of a pilot's drones from step to step
     Rollout    keeps the action before each s too; there is none where an episode begins
-    Agent      keeps the hidden states of the drones, and those that enter the rollout, because a
-               checkpoint must hold both
+    Agent      keeps the hidden states of the drones, and those that enter the rollout; a
+               checkpoint holds both
     learn      unrolls: minibatches of 8 drones, 32 steps each
     mirror     off: a hidden state has no mirror image
     settings   64 drones, 32 steps each; rewards as in pqn.py
@@ -52,8 +52,8 @@ computed by older weights (a stale state).
 
 The control differs in one thing: its h is 0 before every step, in training too. It earns less, and
 crosses as often, as far as two seeds can tell. So h is worth something, but hardly tells where the
-drone is: memory.py, which is told, crosses twice as often. Flown with h = 0 (`drqn forget eval`),
-drqn's seed 0 still crosses 46 % of 200 forests, but earns -27. More steps we have not tried.
+drone is: memory.py, which is told, crosses twice as often. Flown with h = 0,
+drqn's seed 0 still crosses 46 %, but earns -27 (`drqn forget eval --episodes 200`).
 
 [Cho 2014] Learning phrase representations using RNN encoder-decoder, EMNLP. [Hausknecht 2015] Deep
 recurrent Q-learning for partially observable MDPs, AAAI Fall Symposium.
